@@ -1,0 +1,281 @@
+//! One run from beginning to end: policy, verifier, servers, rollouts, records, labels, results.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail, ensure};
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+
+use crate::collector::{Collector, catch_up};
+use crate::labels::LabelStore;
+use crate::policy::Policy;
+use crate::progress::Progress;
+use crate::results::Results;
+use crate::rollout::{Crew, Journal, Keep, Queue, Rollout};
+use crate::run::{self, EpisodeSummary, Run};
+use crate::servers::LocalServers;
+use crate::site::Site;
+use crate::stop::{self, Stop};
+use crate::suite::{Arm, EpisodePlan, Suite, VARIANT_DEFAULT};
+use crate::verifier::Verifier;
+use crate::wire::{Network, OutcomePublisher, VerifierSubscriber};
+
+/// Servers run already; this is for the way to them.
+const SERVERS_WAIT: Duration = Duration::from_secs(30);
+/// A run that needs a verifier and follows one waits this long for the first.
+const VERIFIER_WAIT: Duration = Duration::from_secs(60);
+
+/// What to run, where, and what to keep.
+#[derive(Debug, Clone)]
+pub struct Campaign {
+    /// The command's name: in progress lines and in the default folder.
+    pub title: String,
+    /// Which episodes.
+    pub suite: Suite,
+    /// How each of them is run.
+    pub arms: Vec<Arm>,
+    /// The checkpoint's folder.
+    pub policy: PathBuf,
+    /// The verifier's file, if there is one to score with.
+    pub verifier: Option<PathBuf>,
+    /// The name of a published verifier whose newest version is taken up between episodes.
+    pub follow_verifier: Option<String>,
+    /// Where the world is.
+    pub site: Site,
+    /// Episodes at once.
+    pub sessions: usize,
+    /// The run's folder; by default one that is named after the options, so that the same command goes on.
+    pub out: Option<PathBuf>,
+    /// The label store.
+    pub labels: PathBuf,
+    /// What records hold beside the necessary.
+    pub keep: Keep,
+}
+
+/// What a campaign came to, so far.
+#[derive(Debug)]
+pub struct Report {
+    /// The run's folder.
+    pub folder: PathBuf,
+    /// Rates and gains of all that is recorded.
+    pub results: Results,
+    /// Of everything that the results depend on.
+    pub versions: Value,
+    /// Episodes without a record.
+    pub missing: usize,
+    /// Episodes altogether.
+    pub planned: usize,
+    /// Whether somebody stopped it.
+    pub was_stopped: bool,
+}
+
+impl Report {
+    /// An error when some episode has no outcome, for a partial result must not pass for a whole one.
+    pub fn ensure_complete(&self) -> Result<()> {
+        if self.missing == 0 {
+            return Ok(());
+        }
+        let why = if self.was_stopped { "stopped" } else { "faults" };
+        bail!(
+            "{why}: {} of {} episodes have no outcome; the same command goes on with {}",
+            self.missing,
+            self.planned,
+            self.folder.display()
+        )
+    }
+}
+
+impl Campaign {
+    /// Runs what is not recorded yet.
+    pub fn run(&self) -> Result<Report> {
+        let policy = Policy::load(&self.policy)?;
+        let verifier = match &self.verifier {
+            Some(path) => Some(Arc::new(Verifier::load(path, policy.digest())?)),
+            None => None,
+        };
+        self.check(verifier.is_some())?;
+        let (options, versions) = (self.options(), self.versions(&policy, verifier.as_deref()));
+        let folder = self.out.clone().unwrap_or_else(|| self.default_folder(&options, &versions));
+        let run = Run::open(&folder, options, versions)?;
+        let labels = LabelStore::open(&self.labels)?;
+        catch_up(&labels, &run)?;
+
+        let plans = self.suite.episodes();
+        let recorded = run::recorded(&folder)?;
+        let queue = Queue::new(&run.header.run, &plans, &self.arms, &recorded);
+        let mut was_stopped = false;
+        if !queue.is_empty() {
+            let runtime =
+                tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+            let stage = Stage { policy: &policy, verifier, run, queue, labels };
+            was_stopped = self.roll_out(&runtime, stage)?;
+        }
+        self.report(&folder, &plans, was_stopped)
+    }
+
+    fn check(&self, has_verifier: bool) -> Result<()> {
+        ensure!(!self.arms.is_empty(), "strategies: expected at least one, got none");
+        ensure!(self.sessions > 0, "sessions: expected at least 1, got 0");
+        let needing = self.arms.iter().find(|arm| arm.strategy.needs_verifier());
+        if let (Some(arm), false, None) = (needing, has_verifier, &self.follow_verifier) {
+            bail!("strategy {}: expected a verifier (--verifier FILE), got none", arm.strategy);
+        }
+        Ok(())
+    }
+
+    /// Everything that decides the results, by name. Where it runs and how many episodes at once does not.
+    fn options(&self) -> Value {
+        let Suite { tasks, episodes, placements, range, seed } = &self.suite;
+        json!({
+            "tasks": tasks,
+            "episodes": episodes,
+            "placements": placements,
+            "seeds_from": range.first(),
+            "seed": seed,
+            "arms": self.arms.iter().map(Arm::to_string).collect::<Vec<_>>(),
+            "follow_verifier": self.follow_verifier,
+            "all_hidden": self.keep.all_hidden,
+            "video": self.keep.video,
+        })
+    }
+
+    fn versions(&self, policy: &Policy, verifier: Option<&Verifier>) -> Value {
+        json!({
+            "rever": env!("CARGO_PKG_VERSION"),
+            "protocol": protocol::PROTOCOL_VERSION,
+            "policy": policy.digest(),
+            "verifier": verifier.map(Verifier::digest),
+        })
+    }
+
+    fn default_folder(&self, options: &Value, versions: &Value) -> PathBuf {
+        let digest = Sha256::digest(format!("{options}{versions}"));
+        let short: String = digest.iter().take(4).map(|byte| format!("{byte:02x}")).collect();
+        Path::new("runs").join(format!("{}-{short}", self.title))
+    }
+
+    /// Starts everything, rolls out, ends everything. True when somebody stopped it.
+    fn roll_out(&self, runtime: &tokio::runtime::Runtime, stage: Stage<'_>) -> Result<bool> {
+        let python =
+            if self.site.servers > 0 { Some(self.site.python_environment()?) } else { None };
+        let network = runtime.block_on(Network::open(self.site.network_options()))?;
+        let local =
+            python.map(|python| self.site.start(&python, &network, self.sessions)).transpose()?;
+        let result = runtime.block_on(self.roll_out_on(&network, local.as_ref(), stage));
+        // Servers first: they would report the network's end as an error.
+        drop(local);
+        runtime.block_on(network.close())?;
+        result
+    }
+
+    async fn roll_out_on(
+        &self,
+        network: &Network,
+        local: Option<&LocalServers>,
+        stage: Stage<'_>,
+    ) -> Result<bool> {
+        let Stage { policy, verifier, run, queue, labels } = stage;
+        let servers = self.check_tasks(network).await?;
+        let name = run.header.run.clone();
+        let outcomes = OutcomePublisher::declare(network, &name).await?;
+        let collector = Collector::start(network, &run, labels).await?;
+        let mut follower = match &self.follow_verifier {
+            Some(name) => Some(VerifierSubscriber::declare(network, name).await?),
+            None => None,
+        };
+        if let (Some(follower), None) = (&mut follower, &verifier) {
+            self.first_verifier(follower).await?;
+        }
+        if follower.is_some() {
+            eprintln!("verifiers are awaited at {}", network.listening().join(", "));
+        }
+        let updates = follower.as_ref().map(|follower| {
+            let mut latest = follower.latest();
+            latest.mark_changed();
+            latest
+        });
+        let done = run.summaries()?;
+        let simulator = done.first().map(|summary| summary.simulator.clone());
+        let mut rollout = Rollout {
+            policy,
+            verifier,
+            updates,
+            crew: Crew::new(network, local, policy.image_size(), &name, simulator, servers),
+            sessions: self.sessions,
+            keep: self.keep,
+            stop: stop::listen()?,
+            journal: Journal { progress: self.progress(&done, queue.len()), run, outcomes },
+            queue,
+        };
+        rollout.run().await?;
+        rollout.journal.progress.finish();
+        let was_stopped = *rollout.stop.borrow() != Stop::No;
+        collector.finish(&rollout.journal.run).await?;
+        Ok(was_stopped)
+    }
+
+    /// A task that nobody offers would break every one of its episodes. Gives the number of servers.
+    async fn check_tasks(&self, network: &Network) -> Result<usize> {
+        let servers = network.servers(self.site.servers.max(1), SERVERS_WAIT).await;
+        ensure!(!servers.is_empty(), "no server was to be seen at {:?}", self.site.connect);
+        let offered: BTreeSet<&str> = servers
+            .iter()
+            .flat_map(|server| &server.tasks)
+            .filter(|offer| offer.variant == VARIANT_DEFAULT)
+            .map(|offer| offer.task.as_str())
+            .collect();
+        let missing = self.suite.tasks.iter().find(|task| !offered.contains(task.as_str()));
+        if let Some(task) = missing {
+            bail!("task: expected one of {}, got {task}", Vec::from_iter(offered).join(", "));
+        }
+        Ok(servers.len())
+    }
+
+    fn progress(&self, done: &[EpisodeSummary], waiting: usize) -> Progress {
+        let successes = done.iter().filter(|summary| summary.statistics.is_success).count();
+        let total = done.len() + waiting;
+        Progress::new(&self.title, total as u64, done.len() as u64, successes as u64)
+    }
+
+    async fn first_verifier(&self, follower: &VerifierSubscriber) -> Result<()> {
+        if !self.arms.iter().any(|arm| arm.strategy.needs_verifier()) {
+            return Ok(());
+        }
+        let mut latest = follower.latest();
+        let first = latest.wait_for(Option::is_some);
+        let first = tokio::time::timeout(VERIFIER_WAIT, first).await;
+        let secs = VERIFIER_WAIT.as_secs();
+        first
+            .with_context(|| format!("no verifier was published within {secs} s"))?
+            .map(drop)
+            .context("the network is closed")
+    }
+
+    fn report(&self, folder: &Path, plans: &[EpisodePlan], was_stopped: bool) -> Result<Report> {
+        let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
+        let mut versions = header.versions;
+        let simulator = summaries.first().map(|summary| summary.simulator.as_str());
+        versions["simulator"] = json!(simulator);
+        let planned = plans.len() * self.arms.len();
+        Ok(Report {
+            folder: folder.to_path_buf(),
+            results: Results::new(&summaries, &run::faults(folder)?)?,
+            versions,
+            missing: planned.saturating_sub(summaries.len()),
+            planned,
+            was_stopped,
+        })
+    }
+}
+
+/// What a rollout is made of, before there is a network.
+struct Stage<'a> {
+    policy: &'a Policy,
+    verifier: Option<Arc<Verifier>>,
+    run: Run,
+    queue: Queue,
+    labels: LabelStore,
+}

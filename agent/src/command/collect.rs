@@ -1,0 +1,49 @@
+//! `rever collect`: sampled episodes with their outcomes, for the verifier to learn from.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::Args;
+
+use super::episodes::EpisodesArguments;
+use super::evaluate::{show, temperature};
+use crate::strategy::Strategy;
+use crate::suite::{Arm, Placements, SeedRange, Suite};
+
+/// Runs sampled episodes on random placements that evaluation never sees, and keeps them as labels.
+#[derive(Debug, Clone, Args)]
+pub struct Arguments {
+    #[command(flatten)]
+    episodes_arguments: EpisodesArguments,
+    /// How candidates are chosen: one sample, unless more than one is proposed.
+    #[arg(long, default_value = "sample")]
+    strategy: Strategy,
+    /// Episodes of each task.
+    #[arg(long, default_value_t = 100)]
+    episodes: u32,
+    /// Candidates per step, for strategies that choose.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    candidates: u32,
+    /// Sampling temperature.
+    #[arg(long, default_value_t = 1.0, value_parser = temperature)]
+    temperature: f32,
+    /// Write the results into this file, too.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Runs what is missing, then prints how many episodes succeeded.
+pub fn run(arguments: Arguments) -> Result<()> {
+    let suite = Suite {
+        tasks: arguments.episodes_arguments.tasks.clone(),
+        episodes: arguments.episodes,
+        placements: Placements::Random,
+        range: SeedRange::Collection,
+        seed: arguments.episodes_arguments.seed,
+    };
+    let arm = Arm::new(arguments.strategy, arguments.candidates, arguments.temperature);
+    let campaign = arguments.episodes_arguments.campaign("collect", suite, vec![arm])?;
+    let report = campaign.run()?;
+    println!("labels: {}", campaign.labels.display());
+    show(&report, arguments.json.as_deref())
+}

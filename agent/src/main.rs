@@ -1,0 +1,21 @@
+//! The program `rever`: parses the command line, runs one subcommand, prints one error.
+
+use std::process::ExitCode;
+
+use agent::command::Program;
+use clap::Parser;
+
+fn main() -> ExitCode {
+    // Wrong usage ends inside `parse`, with status 2 and a message that says what was expected.
+    let program = Program::parse();
+    #[expect(clippy::disallowed_methods, reason = "this is main")]
+    let filter = std::env::var("REVER_LOG").ok();
+    agent::command::start_log(filter.as_deref());
+    match program.run() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(1)
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! Live progress with an estimate: a bar in a terminal, plain lines elsewhere.
+
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+/// How often a plain line is printed where there is no terminal.
+const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// How far a run has come. Episodes that were recorded before this start count as done, but not for the estimate.
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    total: u64,
+    done: u64,
+    done_before: u64,
+    successes: u64,
+    steps: u64,
+    /// Steps of the episodes that were recorded since the start.
+    steps_recorded: u64,
+    faults: u64,
+    running: usize,
+    started: Instant,
+    printed: Instant,
+}
+
+impl Progress {
+    /// `done` of `total` episodes are recorded already, `successes` of them successful.
+    pub fn new(title: &str, total: u64, done: u64, successes: u64) -> Progress {
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {msg}");
+            let bar =
+                ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(4));
+            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+                .with_prefix(title.to_owned())
+        });
+        if bar.is_none() {
+            eprintln!("{title}: {done} of {total} episodes recorded");
+        }
+        let now = Instant::now();
+        Progress {
+            bar,
+            total,
+            done,
+            done_before: done,
+            successes,
+            steps: 0,
+            steps_recorded: 0,
+            faults: 0,
+            running: 0,
+            started: now,
+            printed: now,
+        }
+    }
+
+    /// One control step of `running` episodes is over.
+    pub fn stepped(&mut self, running: usize) {
+        self.running = running;
+        self.steps += running as u64;
+        self.show();
+    }
+
+    /// An episode of so many steps is recorded.
+    pub fn recorded(&mut self, is_success: bool, steps: usize) {
+        self.done += 1;
+        self.steps_recorded += steps as u64;
+        self.successes += u64::from(is_success);
+        self.show();
+    }
+
+    /// An attempt broke.
+    pub fn faulted(&mut self, reason: &str) {
+        self.faults += 1;
+        self.say(&format!("fault: {reason}"));
+    }
+
+    /// Prints a line without breaking the bar.
+    pub fn say(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{line}")),
+            None => eprintln!("{line}"),
+        }
+    }
+
+    /// Leaves the last state on the screen.
+    pub fn finish(&self) {
+        let line = self.line(self.started.elapsed());
+        match &self.bar {
+            Some(bar) => bar.abandon_with_message(line),
+            None => eprintln!("{}/{} {line}", self.done, self.total),
+        }
+    }
+
+    fn show(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(self.done);
+            bar.set_message(self.line(self.started.elapsed()));
+        } else if self.printed.elapsed() >= LINE_EVERY {
+            self.printed = Instant::now();
+            eprintln!("{}/{} {}", self.done, self.total, self.line(self.started.elapsed()));
+        }
+    }
+
+    fn line(&self, elapsed: Duration) -> String {
+        let secs = elapsed.as_secs_f64().max(1e-3);
+        let here = self.done - self.done_before;
+        let mut parts = Vec::new();
+        if self.done > 0 {
+            parts
+                .push(format!("success {:.0} %", 100.0 * self.successes as f64 / self.done as f64));
+        }
+        parts.push(format!("{:.1} steps/s", self.steps as f64 / secs));
+        if self.faults > 0 {
+            parts.push(format!("{} faults", self.faults));
+        }
+        // Counted in steps: episodes of a batch end together, so that their own rate comes in waves.
+        if here > 0 && self.done < self.total {
+            let steps_expected =
+                (self.total - self.done) as f64 * self.steps_recorded as f64 / here as f64;
+            let steps_ahead = (self.steps - self.steps_recorded) as f64;
+            let left = (steps_expected - steps_ahead).max(0.0) * secs / self.steps.max(1) as f64;
+            parts.push(format!("{} left", clock(left)));
+        } else if self.done < self.total {
+            parts.push(format!("{} running", self.running));
+        } else {
+            parts.push(format!("in {}", clock(secs)));
+        }
+        parts.join(", ")
+    }
+}
+
+/// Seconds as a person reads them.
+fn clock(secs: f64) -> String {
+    let secs = secs.round() as u64;
+    match secs {
+        0..60 => format!("{secs} s"),
+        60..3600 => format!("{} min {:02} s", secs / 60, secs % 60),
+        _ => format!("{} h {:02} min", secs / 3600, secs % 3600 / 60),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_are_readable() {
+        let read = [0.4, 59.4, 61.0, 3599.0, 7320.0].map(clock);
+        assert_eq!(read, ["0 s", "59 s", "1 min 01 s", "59 min 59 s", "2 h 02 min"]);
+    }
+
+    #[test]
+    fn the_estimate_counts_only_what_this_start_has_done() {
+        let mut progress = Progress::new("test", 20, 10, 5);
+        for _ in 0..10 {
+            progress.stepped(4);
+        }
+        assert_eq!(progress.line(Duration::from_secs(10)), "success 50 %, 4.0 steps/s, 4 running");
+        progress.recorded(true, 10);
+        progress.recorded(true, 10);
+        // Two episodes had 10 steps each, so the eight that are left have 80; of these, 20 are done.
+        assert_eq!(progress.line(Duration::from_secs(10)), "success 58 %, 4.0 steps/s, 15 s left");
+    }
+}

@@ -1,0 +1,157 @@
+//! The file that `--json` writes: the same figures as the tables, for programs.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use serde::Serialize;
+use serde_json::Value;
+
+use crate::results::{DecisionTime, Rates, Results};
+use crate::statistics::Rate;
+use crate::suite::{Arm, VARIANT_DEFAULT};
+
+/// The task that stands for all tasks together.
+pub const AVERAGE: &str = "average";
+
+/// The whole file. Rates, gains and interval ends are fractions of 1.
+#[derive(Debug, Serialize)]
+pub struct ResultFile {
+    /// One row per arm and task, and one per arm for all tasks.
+    pub rows: Vec<Row>,
+    /// One entry per comparison.
+    pub paired: Vec<Paired>,
+    /// One entry per arm that chooses, where one sample and the oracle ran beside it.
+    pub headroom: Vec<Headroom>,
+    /// None when nothing was decided.
+    pub decision_ms: Option<DecisionTime>,
+    /// Of everything that the results depend on, by name.
+    pub versions: Value,
+}
+
+/// One arm on one task.
+#[derive(Debug, Serialize)]
+pub struct Row {
+    /// The task's name, or [`AVERAGE`].
+    pub task: String,
+    /// The task's variant.
+    pub variant: String,
+    /// How candidates were chosen.
+    pub strategy: String,
+    /// Candidates per step.
+    pub candidates: u32,
+    /// Sampling temperature; 0 is greedy.
+    pub temperature: f32,
+    /// Episodes with an outcome: the number that all rates of the row are over.
+    pub episodes: u64,
+    /// Attempts that broke and were run again or given up; in no rate.
+    pub faults: u64,
+    /// The object was held at some step.
+    pub grasp: Option<f64>,
+    /// Success at the last step.
+    pub success: Option<f64>,
+    /// Lower end of the 95 % Wilson interval of `success`.
+    pub success_low: f64,
+    /// Upper end.
+    pub success_high: f64,
+    /// Success at some step.
+    pub success_any_step: Option<f64>,
+    /// Success at the last step with the object let go.
+    pub success_released: Option<f64>,
+}
+
+/// The difference of last-step success, `a` less `b`, averaged over tasks.
+#[derive(Debug, Serialize)]
+pub struct Paired {
+    /// The strategy in question.
+    pub a: String,
+    /// The one that it is compared with.
+    pub b: String,
+    /// Of `a`.
+    pub candidates: u32,
+    /// Of `a`; `b` has the same unless it is greedy.
+    pub temperature: f32,
+    /// Pairs over all tasks.
+    pub episodes: usize,
+    /// The difference.
+    pub gain: f64,
+    /// Lower end of its 95 % bootstrap interval.
+    pub low: f64,
+    /// Upper end.
+    pub high: f64,
+}
+
+/// The part of the way from one sample to the oracle.
+#[derive(Debug, Serialize)]
+pub struct Headroom {
+    /// The strategy in question.
+    pub strategy: String,
+    /// Candidates per step, of the oracle, too.
+    pub candidates: u32,
+    /// Sampling temperature of all three.
+    pub temperature: f32,
+    /// 1 is as good as the oracle.
+    pub fraction: f64,
+}
+
+impl ResultFile {
+    /// The file's contents.
+    pub fn new(results: &Results, versions: Value) -> ResultFile {
+        let mut rows = Vec::new();
+        for result in &results.arms {
+            for (task, rates) in results.tasks.iter().zip(&result.tasks) {
+                rows.push(row(task, &result.arm, rates));
+            }
+            rows.push(row(AVERAGE, &result.arm, &result.all));
+        }
+        let paired = results.gains.iter().map(|gain| Paired {
+            a: gain.better.strategy.to_string(),
+            b: gain.worse.strategy.to_string(),
+            candidates: gain.better.candidates,
+            temperature: gain.better.temperature,
+            episodes: gain.gain.pairs,
+            gain: gain.gain.mean,
+            low: gain.gain.interval.low,
+            high: gain.gain.interval.high,
+        });
+        let headroom = results.headroom.iter().map(|headroom| Headroom {
+            strategy: headroom.arm.strategy.to_string(),
+            candidates: headroom.arm.candidates,
+            temperature: headroom.arm.temperature,
+            fraction: headroom.fraction,
+        });
+        ResultFile {
+            rows,
+            paired: paired.collect(),
+            headroom: headroom.collect(),
+            decision_ms: results.decision_ms,
+            versions,
+        }
+    }
+
+    /// Writes the file.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let mut text = serde_json::to_string_pretty(self)?;
+        text.push('\n');
+        std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+    }
+}
+
+fn row(task: &str, arm: &Arm, rates: &Rates) -> Row {
+    let value = |rate: Rate| rate.value();
+    let interval = rates.success.interval();
+    Row {
+        task: task.to_owned(),
+        variant: VARIANT_DEFAULT.to_owned(),
+        strategy: arm.strategy.to_string(),
+        candidates: arm.candidates,
+        temperature: arm.temperature,
+        episodes: rates.success.trials,
+        faults: rates.faults,
+        grasp: value(rates.grasped),
+        success: value(rates.success),
+        success_low: interval.low,
+        success_high: interval.high,
+        success_any_step: value(rates.ever_success),
+        success_released: value(rates.released_success),
+    }
+}

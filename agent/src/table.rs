@@ -1,0 +1,144 @@
+//! The tables that a terminal shows: success of every arm on every task, gains, success against N.
+
+use std::fmt::Write;
+
+use crate::results::{ArmResult, Rates, Results};
+use crate::statistics::Rate;
+use crate::strategy::Strategy;
+
+/// All tables, one after the other. Every percentage carries its number of episodes or its interval.
+pub fn text(results: &Results) -> String {
+    let parts = [rates(results), gains(results), by_candidates(results), decisions(results)];
+    parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
+}
+
+/// One block per task and one for all: SIMPLER's result first, the other readings of success beside it.
+fn rates(results: &Results) -> String {
+    let mut rows = vec![
+        ["", "success %", "95 %", "grasp %", "any step %", "released %", "n", "faults"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
+    let blocks = results.tasks.iter().enumerate().map(|(index, task)| (task.as_str(), Some(index)));
+    for (title, index) in blocks.chain([("average", None)]) {
+        rows.push(vec![title.to_owned()]);
+        for result in &results.arms {
+            rows.push(rate_row(result, index.map_or(&result.all, |index| &result.tasks[index])));
+        }
+    }
+    aligned(&rows)
+}
+
+fn rate_row(result: &ArmResult, rates: &Rates) -> Vec<String> {
+    let interval = rates.success.interval();
+    vec![
+        format!("  {}", result.arm),
+        percent(rates.success),
+        format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high),
+        percent(rates.grasped),
+        percent(rates.ever_success),
+        percent(rates.released_success),
+        rates.success.trials.to_string(),
+        rates.faults.to_string(),
+    ]
+}
+
+fn gains(results: &Results) -> String {
+    if results.gains.is_empty() {
+        return String::new();
+    }
+    let mut rows =
+        vec![["gain in points, paired", "", "95 %", "pairs"].map(str::to_owned).to_vec()];
+    for gain in &results.gains {
+        let interval = gain.gain.interval;
+        rows.push(vec![
+            format!("  {} over {}", gain.better, gain.worse),
+            format!("{:+.1}", 100.0 * gain.gain.mean),
+            format!("[{:+.1}, {:+.1}]", 100.0 * interval.low, 100.0 * interval.high),
+            gain.gain.pairs.to_string(),
+        ]);
+    }
+    for headroom in &results.headroom {
+        let title = format!("  {}: part of the way from one sample to the oracle", headroom.arm);
+        rows.push(vec![title, format!("{:.0} %", 100.0 * headroom.fraction)]);
+    }
+    aligned(&rows)
+}
+
+/// Where a strategy ran with several numbers of candidates; one sample is its first point.
+fn by_candidates(results: &Results) -> String {
+    let mut rows =
+        vec![["success against N", "N", "success %", "95 %"].map(str::to_owned).to_vec()];
+    for strategy in Strategy::ALL {
+        let of_strategy = |result: &&ArmResult| result.arm.strategy == strategy;
+        let mut temperatures: Vec<f32> =
+            results.arms.iter().filter(of_strategy).map(|result| result.arm.temperature).collect();
+        temperatures.dedup();
+        for temperature in temperatures {
+            let is_point = |result: &&ArmResult| {
+                result.arm.temperature == temperature
+                    && [strategy, Strategy::Sample].contains(&result.arm.strategy)
+            };
+            let points: Vec<&ArmResult> = results.arms.iter().filter(is_point).collect();
+            if points.iter().filter(|result| of_strategy(result)).count() < 2 {
+                continue;
+            }
+            for point in points {
+                let interval = point.all.success.interval();
+                rows.push(vec![
+                    format!("  {strategy} T={temperature}"),
+                    point.arm.candidates.to_string(),
+                    percent(point.all.success),
+                    format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high),
+                ]);
+            }
+        }
+    }
+    if rows.len() == 1 { String::new() } else { aligned(&rows) }
+}
+
+fn decisions(results: &Results) -> String {
+    let line = |time: crate::results::DecisionTime| {
+        format!("decision of a whole batch: {:.0} ms (p50), {:.0} ms (p95)\n", time.p50, time.p95)
+    };
+    results.decision_ms.map(line).unwrap_or_default()
+}
+
+fn percent(rate: Rate) -> String {
+    rate.value().map_or_else(|| "-".to_owned(), |value| format!("{:.1}", 100.0 * value))
+}
+
+/// The first column to the left, the others to the right.
+pub fn aligned(rows: &[Vec<String>]) -> String {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let cells = |column: usize| rows.iter().filter_map(move |row| row.get(column));
+    let widths: Vec<usize> = (0..columns)
+        .map(|column| cells(column).map(|cell| cell.chars().count()).max().unwrap_or(0))
+        .collect();
+    let mut text = String::new();
+    for row in rows {
+        let mut line = String::new();
+        for (column, (cell, width)) in row.iter().zip(&widths).enumerate() {
+            // Writing to a string cannot fail.
+            let _ = match column {
+                0 => write!(line, "{cell:width$}"),
+                _ => write!(line, "  {cell:>width$}"),
+            };
+        }
+        text.push_str(line.trim_end());
+        text.push('\n');
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_are_aligned_whatever_they_hold() {
+        let rows = [vec!["a", "success %"], vec!["title"], vec!["  longer", "–", "9"]];
+        let rows = rows.map(|row| row.into_iter().map(str::to_owned).collect::<Vec<_>>());
+        assert_eq!(aligned(&rows), "a         success %\ntitle\n  longer          –  9\n");
+    }
+}

@@ -1,0 +1,333 @@
+//! Which records may teach the verifier, and what they become.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail, ensure};
+use protocol::EpisodeOutcome;
+
+use super::LabelledEpisode;
+use crate::labels::{LabelStore, outcome};
+use crate::record::{EpisodeRecord, hidden_from_bytes};
+use crate::run::{record_path, recorded};
+use crate::strategy::Strategy;
+use crate::suite::SeedRange;
+
+/// Why an episode must not teach the verifier of a policy.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Objection {
+    /// Its placement is one of those kept for evaluation.
+    Configuration(u32),
+    /// Its scene is not one of those for collection.
+    Seed(u64),
+    /// Its candidates were not sampled.
+    Temperature(f32),
+    /// Its actions were not chosen from what the policy alone knows; or nobody knows how.
+    Strategy(String),
+    /// Its hidden states mean something else to this policy.
+    Policy(String),
+    /// It never acted, so it has no outcome.
+    NoSteps,
+}
+
+impl Objection {
+    /// The reason in few words, the same for all episodes that it holds for.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Objection::Configuration(_) => "placement of the evaluation",
+            Objection::Seed(_) => "seed outside of the collection range",
+            Objection::Temperature(_) => "greedy",
+            Objection::Strategy(_) => "chosen by the expert",
+            Objection::Policy(_) => "another policy",
+            Objection::NoSteps => "no outcome",
+        }
+    }
+}
+
+impl fmt::Display for Objection {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let first = SeedRange::Collection.first();
+        match self {
+            Objection::Configuration(configuration) => {
+                write!(formatter, "expected a random placement, got configuration {configuration}")
+            }
+            Objection::Seed(seed) => {
+                write!(
+                    formatter,
+                    "expected a seed of the collection range from {first} on, got {seed}"
+                )
+            }
+            Objection::Temperature(temperature) => {
+                write!(formatter, "expected a temperature above 0, got {temperature}")
+            }
+            Objection::Strategy(strategy) => {
+                write!(
+                    formatter,
+                    "expected a strategy that does without the expert, got {strategy}"
+                )
+            }
+            Objection::Policy(policy) => {
+                write!(
+                    formatter,
+                    "expected hidden states of the policy to train for, got policy {policy}"
+                )
+            }
+            Objection::NoSteps => {
+                write!(formatter, "expected an outcome, got an episode without steps")
+            }
+        }
+    }
+}
+
+impl std::error::Error for Objection {}
+
+/// Whether an episode may teach the verifier of the policy with this digest.
+pub fn object(outcome: &EpisodeOutcome, policy: &str) -> Option<Objection> {
+    let with_expert = |strategy: &str| strategy.parse().map_or(true, Strategy::needs_expert);
+    if let Some(configuration) = outcome.configuration {
+        Some(Objection::Configuration(configuration))
+    } else if !SeedRange::Collection.contains(outcome.seed) {
+        Some(Objection::Seed(outcome.seed))
+    } else if outcome.temperature <= 0.0 {
+        Some(Objection::Temperature(outcome.temperature))
+    } else if with_expert(&outcome.strategy) {
+        Some(Objection::Strategy(outcome.strategy.clone()))
+    } else if outcome.policy != policy {
+        Some(Objection::Policy(outcome.policy.clone()))
+    } else if outcome.steps == 0 {
+        Some(Objection::NoSteps)
+    } else {
+        None
+    }
+}
+
+/// All episodes of the given runs; refuses, naming the record, when one of them must not teach.
+///
+/// A run was named by hand: leaving a part of it out in silence would hide a mistake.
+pub fn from_runs(folders: &[PathBuf], policy: &str) -> anyhow::Result<Vec<LabelledEpisode>> {
+    let mut episodes = Vec::new();
+    for folder in folders {
+        for id in recorded(folder)? {
+            let path = record_path(folder, &id);
+            let record = EpisodeRecord::read(&path)?;
+            episodes.push(
+                labelled(&record, policy).with_context(|| format!("record {}", path.display()))?,
+            );
+        }
+    }
+    Ok(episodes)
+}
+
+/// The episodes of a label store that may teach, and how many were set aside for which reason.
+///
+/// A store is fed by every run, evaluations included, so most objections are in order here.
+pub fn from_labels(
+    path: &Path,
+    policy: &str,
+) -> anyhow::Result<(Vec<LabelledEpisode>, BTreeMap<&'static str, usize>)> {
+    // Opening would make an empty store.
+    ensure!(path.is_file(), "label store {}: expected a file, got none", path.display());
+    let (mut episodes, mut set_aside) = (Vec::new(), BTreeMap::new());
+    for label in LabelStore::open(path)?.labels()? {
+        let reason = match (object(&label.outcome, policy), label.record) {
+            (Some(objection), _) => objection.reason(),
+            (None, None) => "record on another machine",
+            (None, Some(path)) => {
+                let record = EpisodeRecord::read(&path)?;
+                let same = outcome(&record) == label.outcome;
+                ensure!(
+                    same,
+                    "record {}: expected the episode of its label, got another",
+                    path.display()
+                );
+                let episode = labelled(&record, policy);
+                episodes.push(episode.with_context(|| format!("record {}", path.display()))?);
+                continue;
+            }
+        };
+        *set_aside.entry(reason).or_insert(0) += 1;
+    }
+    Ok((episodes, set_aside))
+}
+
+/// The record as training samples; refuses what must not teach.
+pub fn labelled(record: &EpisodeRecord, policy: &str) -> anyhow::Result<LabelledEpisode> {
+    if let Some(objection) = object(&outcome(record), policy) {
+        bail!(objection);
+    }
+    let (mut hidden, mut steps) = (Vec::new(), Vec::new());
+    for (index, step) in record.steps.iter().enumerate() {
+        // The robot held still: nothing that the policy said was executed.
+        let Some(chosen) = step.chosen else { continue };
+        let candidate = step.candidates.get(chosen as usize);
+        let bytes = candidate.and_then(|candidate| candidate.hidden.as_ref());
+        let bytes = bytes.with_context(|| {
+            format!("step {index}: expected the chosen candidate's hidden state, got none")
+        })?;
+        hidden.extend(hidden_from_bytes(bytes).with_context(|| format!("step {index}"))?);
+        steps.push(index);
+    }
+    Ok(LabelledEpisode {
+        name: format!("{}/{}", record.identity.run, record.identity.id()),
+        task: record.identity.task.clone(),
+        is_success: record.statistics.is_success,
+        hidden,
+        steps,
+        steps_total: record.steps.len(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::labels::Label;
+    use crate::record::{
+        CandidateRecord, EpisodeIdentity, RECORD_VERSION, StepRecord, Versions, hidden_to_bytes,
+    };
+    use protocol::Statistics;
+
+    /// Three steps with two candidates each; the second is executed, except in the last step, in which none is.
+    fn record(episode: u32) -> EpisodeRecord {
+        let candidate = |value: f32| CandidateRecord {
+            tokens: vec![1, 2],
+            action: Some([0.0; 7]),
+            malformed: None,
+            score: None,
+            log_probability: -1.0,
+            hidden: Some(hidden_to_bytes(&[value, 0.5])),
+        };
+        let step = |index: usize| StepRecord {
+            candidates: vec![candidate(-9.0), candidate(index as f32)],
+            chosen: (index < 2).then_some(1),
+            statistics: Statistics::default(),
+            decision_ms: 1.0,
+            step_ms: 1.0,
+        };
+        EpisodeRecord {
+            version: RECORD_VERSION,
+            identity: EpisodeIdentity {
+                run: "run-1".to_owned(),
+                task: "widowx_stack_cube".to_owned(),
+                variant: "default".to_owned(),
+                configuration: None,
+                episode,
+                seed: SeedRange::Collection.first() + u64::from(episode),
+                sampling_seed: 5,
+                strategy: "sample".to_owned(),
+                candidates: 2,
+                temperature: 1.0,
+            },
+            versions: Versions {
+                rever: "0.0.0".to_owned(),
+                protocol: 1,
+                simulator: "mujoco 3.8.0".to_owned(),
+                policy: "cafe".to_owned(),
+                verifier: None,
+            },
+            instruction: "stack".to_owned(),
+            statistics: Statistics { is_success: true, ..Statistics::default() },
+            steps: (0..3).map(step).collect(),
+            wall_secs: 1.0,
+        }
+    }
+
+    fn write(folder: &Path, records: &[EpisodeRecord]) {
+        std::fs::create_dir_all(folder.join("episodes")).expect("a folder");
+        for record in records {
+            record.write(&record_path(folder, &record.identity.id())).expect("a record");
+        }
+    }
+
+    #[test]
+    fn a_record_gives_the_executed_candidates_of_the_steps_that_had_one() {
+        let episode = labelled(&record(3), "cafe").expect("it may teach");
+        assert_eq!(episode.name, "run-1/widowx_stack_cube-default-0003-sample-n2-t1");
+        assert_eq!(episode.hidden, [0.0, 0.5, 1.0, 0.5]);
+        assert_eq!((episode.steps, episode.steps_total, episode.is_success), (vec![0, 1], 3, true));
+    }
+
+    #[test]
+    fn what_must_not_teach_is_refused_in_words() {
+        let check = |change: fn(&mut EpisodeRecord), expected: &str| {
+            let mut record = record(0);
+            change(&mut record);
+            let error = labelled(&record, "cafe").expect_err(expected);
+            assert_eq!(error.to_string(), expected);
+        };
+        check(
+            |record| record.identity.configuration = Some(7),
+            "expected a random placement, got configuration 7",
+        );
+        check(
+            |record| record.identity.seed = SeedRange::Evaluation.first(),
+            "expected a seed of the collection range from 1000000000 on, got 3000000000",
+        );
+        check(
+            |record| record.identity.seed = SeedRange::Tuning.first() + 5,
+            "expected a seed of the collection range from 1000000000 on, got 2000000005",
+        );
+        check(|record| record.identity.temperature = 0.0, "expected a temperature above 0, got 0");
+        check(
+            |record| record.identity.strategy = "oracle".to_owned(),
+            "expected a strategy that does without the expert, got oracle",
+        );
+        check(
+            |record| record.versions.policy = "beef".to_owned(),
+            "expected hidden states of the policy to train for, got policy beef",
+        );
+        check(|record| record.steps.clear(), "expected an outcome, got an episode without steps");
+        check(
+            |record| record.steps[1].candidates[1].hidden = None,
+            "step 1: expected the chosen candidate's hidden state, got none",
+        );
+    }
+
+    #[test]
+    fn a_run_with_one_bad_record_is_refused_by_its_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let runs = [folder.path().to_path_buf()];
+        write(folder.path(), &[record(0), record(1)]);
+        assert_eq!(from_runs(&runs, "cafe").expect("two episodes").len(), 2);
+        let mut bad = record(2);
+        bad.identity.configuration = Some(7);
+        write(folder.path(), &[bad]);
+        let error = format!("{:#}", from_runs(&runs, "cafe").expect_err("one is bad"));
+        assert!(
+            error
+                .contains("widowx_stack_cube-default-0002-sample-n2-t1.msgpack: expected a random"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn a_label_store_sets_aside_what_must_not_teach_and_counts_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut records = [record(0), record(1), record(2), record(3)];
+        records[1].identity.seed = SeedRange::Evaluation.first();
+        records[2].versions.policy = "beef".to_owned();
+        write(folder.path(), &records);
+        let path = folder.path().join("labels.sqlite");
+        let store = LabelStore::open(&path).expect("a store");
+        for record in &records[..3] {
+            let path = record_path(folder.path(), &record.identity.id());
+            assert!(store.insert(&Label::new(record, &path)).expect("a row"));
+        }
+        assert!(store.insert(&Label::of_outcome(outcome(&records[3]))).expect("a row"));
+        drop(store);
+        let (episodes, set_aside) = from_labels(&path, "cafe").expect("a whole store");
+        assert_eq!(episodes.len(), 1);
+        let expected = [
+            ("another policy", 1),
+            ("record on another machine", 1),
+            ("seed outside of the collection range", 1),
+        ];
+        assert_eq!(set_aside, BTreeMap::from(expected));
+        let missing =
+            from_labels(&folder.path().join("none.sqlite"), "cafe").expect_err("no store");
+        assert!(
+            missing.to_string().ends_with("none.sqlite: expected a file, got none"),
+            "{missing}"
+        );
+    }
+}

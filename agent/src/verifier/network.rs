@@ -1,0 +1,225 @@
+//! The verifier's arithmetic: standardise, two hidden layers with ReLU, one logit.
+//!
+//! Plain loops in a fixed order: a few microseconds a row, and a row's result cannot depend on the batch or the thread count.
+
+use anyhow::ensure;
+
+/// Shift and scale that make every input about as large as the others, measured on the training samples.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Standardisation {
+    /// Subtracted from the input.
+    pub mean: Vec<f32>,
+    /// Divides the difference; above 0 everywhere.
+    pub deviation: Vec<f32>,
+}
+
+impl Standardisation {
+    /// Below this a feature counts as constant and is only shifted: dividing by noise would blow it up.
+    const DEVIATION_MIN: f64 = 1e-6;
+
+    /// Measures rows of `size` values that lie one after another.
+    pub fn of<'a>(size: usize, rows: impl Iterator<Item = &'a [f32]> + Clone) -> Standardisation {
+        let count = rows.clone().count().max(1) as f64;
+        let mut mean = vec![0.0_f64; size];
+        for row in rows.clone() {
+            mean.iter_mut().zip(row).for_each(|(mean, value)| *mean += f64::from(*value) / count);
+        }
+        let mut variance = vec![0.0_f64; size];
+        for row in rows {
+            let differences = row.iter().zip(&mean).map(|(value, mean)| f64::from(*value) - mean);
+            variance
+                .iter_mut()
+                .zip(differences)
+                .for_each(|(variance, difference)| *variance += difference * difference / count);
+        }
+        let deviation = variance.into_iter().map(f64::sqrt);
+        let deviation =
+            deviation.map(|value| if value < Self::DEVIATION_MIN { 1.0 } else { value as f32 });
+        Standardisation {
+            deviation: deviation.collect(),
+            mean: mean.into_iter().map(|value| value as f32).collect(),
+        }
+    }
+
+    /// The standardised row.
+    pub fn apply(&self, row: &[f32]) -> Vec<f32> {
+        assert_eq!(row.len(), self.mean.len(), "the hidden state has the verifier's input size");
+        let parts = row.iter().zip(&self.mean).zip(&self.deviation);
+        parts.map(|((value, mean), deviation)| (value - mean) / deviation).collect()
+    }
+}
+
+/// One affine layer.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layer {
+    /// (outputs, inputs), row by row: the order of the file.
+    weight: Vec<f32>,
+    /// (inputs, outputs): the order of the loop, so that the inner one runs over contiguous outputs.
+    transposed: Vec<f32>,
+    bias: Vec<f32>,
+}
+
+impl Layer {
+    /// A layer from its weight (outputs, inputs) and bias (outputs).
+    pub fn new(weight: Vec<f32>, bias: Vec<f32>) -> anyhow::Result<Layer> {
+        let outputs = bias.len();
+        ensure!(
+            outputs > 0 && !weight.is_empty() && weight.len().is_multiple_of(outputs),
+            "layer weight: expected a positive multiple of {outputs} outputs, got {} values",
+            weight.len()
+        );
+        ensure!(
+            weight.iter().chain(&bias).all(|value| value.is_finite()),
+            "layer: expected finite values, got NaN or infinity"
+        );
+        let inputs = weight.len() / outputs;
+        // (outputs, inputs) -> (inputs, outputs)
+        let transposed = (0..inputs).flat_map(|i| (0..outputs).map(move |o| (i, o)));
+        let transposed = transposed.map(|(i, o)| weight[o * inputs + i]).collect();
+        Ok(Layer { transposed, weight, bias })
+    }
+
+    /// Length of the vector that goes in.
+    pub fn inputs(&self) -> usize {
+        self.weight.len() / self.bias.len()
+    }
+
+    /// Length of the vector that comes out.
+    pub fn outputs(&self) -> usize {
+        self.bias.len()
+    }
+
+    /// (outputs, inputs), row by row.
+    pub fn weight(&self) -> &[f32] {
+        &self.weight
+    }
+
+    /// One value per output.
+    pub fn bias(&self) -> &[f32] {
+        &self.bias
+    }
+
+    fn apply(&self, input: &[f32]) -> Vec<f32> {
+        let mut output = self.bias.clone();
+        for (value, weights) in input.iter().zip(self.transposed.chunks_exact(self.bias.len())) {
+            output.iter_mut().zip(weights).for_each(|(output, weight)| *output += value * weight);
+        }
+        output
+    }
+}
+
+/// The whole network; its layers fit each other.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Network {
+    standardisation: Standardisation,
+    layers: [Layer; 3],
+}
+
+impl Network {
+    /// A network of two hidden layers and one output.
+    pub fn new(standardisation: Standardisation, layers: [Layer; 3]) -> anyhow::Result<Network> {
+        let size = standardisation.mean.len();
+        let deviations = &standardisation.deviation;
+        ensure!(
+            deviations.len() == size
+                && deviations.iter().all(|value| value.is_finite() && *value > 0.0),
+            "standardisation: expected {size} finite deviations above 0, got {} values",
+            deviations.len()
+        );
+        ensure!(
+            standardisation.mean.iter().all(|value| value.is_finite()),
+            "standardisation: expected finite means"
+        );
+        let [first, second, last] = &layers;
+        let sizes = [
+            (first.inputs(), size),
+            (second.inputs(), first.outputs()),
+            (last.inputs(), second.outputs()),
+            (last.outputs(), 1),
+        ];
+        for (found, expected) in sizes {
+            ensure!(
+                found == expected,
+                "verifier layers: expected a size of {expected}, got {found}"
+            );
+        }
+        Ok(Network { standardisation, layers })
+    }
+
+    /// Length of a hidden state.
+    pub fn input_size(&self) -> usize {
+        self.standardisation.mean.len()
+    }
+
+    /// What is done to a hidden state before the first layer.
+    pub fn standardisation(&self) -> &Standardisation {
+        &self.standardisation
+    }
+
+    /// First hidden layer, second hidden layer, output.
+    pub fn layers(&self) -> &[Layer; 3] {
+        &self.layers
+    }
+
+    /// The logit of one hidden state.
+    pub fn logit(&self, hidden: &[f32]) -> f32 {
+        let [first, second, last] = &self.layers;
+        let values = relu(first.apply(&self.standardisation.apply(hidden)));
+        last.apply(&relu(second.apply(&values)))[0]
+    }
+}
+
+fn relu(mut values: Vec<f32>) -> Vec<f32> {
+    values.iter_mut().for_each(|value| *value = value.max(0.0));
+    values
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_network_small_enough_to_compute_by_hand() {
+        let standardisation = Standardisation { mean: vec![1.0, 0.0], deviation: vec![2.0, 0.5] };
+        let layers = [
+            Layer::new(vec![1.0, 2.0, -1.0, 0.5], vec![0.0, 1.0]),
+            Layer::new(vec![1.0, 1.0, -1.0, 0.0], vec![-1.0, 0.25]),
+            Layer::new(vec![2.0, 3.0], vec![0.5]),
+        ];
+        let network = Network::new(standardisation, layers.map(|layer| layer.expect("whole")))
+            .expect("fitting");
+        // Standardised [1, 2]; first layer [5, 1]; second relu([5, -4.75]) = [5, 0]; output 2 * 5 + 0.5.
+        assert_eq!(network.logit(&[3.0, 1.0]), 10.5);
+        // Standardised [-1, -2]; first relu([-5, 1]) = [0, 1]; second relu([0, 0.25]); output 3 * 0.25 + 0.5.
+        assert_eq!(network.logit(&[-1.0, -1.0]), 1.25);
+    }
+
+    #[test]
+    fn standardised_rows_have_mean_zero_and_deviation_one() {
+        let rows = [[1.0, 5.0], [2.0, 5.0], [3.0, 5.0], [6.0, 5.0]];
+        let standardisation = Standardisation::of(2, rows.iter().map(|row| row.as_slice()));
+        assert_eq!(standardisation.mean, [3.0, 5.0]);
+        assert!((standardisation.deviation[0] - 3.5_f32.sqrt()).abs() < 1e-6);
+        // A constant feature is only shifted.
+        assert_eq!(standardisation.apply(&[3.0, 6.0]), [0.0, 1.0]);
+    }
+
+    #[test]
+    fn layers_that_do_not_fit_are_refused() {
+        let layer = |weights: usize, outputs: usize| {
+            Layer::new(vec![0.5; weights], vec![0.0; outputs]).expect("whole")
+        };
+        let standardisation = || Standardisation { mean: vec![0.0; 2], deviation: vec![1.0; 2] };
+        let fit = |layers| Network::new(standardisation(), layers);
+        assert!(fit([layer(6, 3), layer(6, 2), layer(2, 1)]).is_ok());
+        let error =
+            fit([layer(6, 3), layer(8, 2), layer(2, 1)]).expect_err("4 inputs after 3 outputs");
+        assert_eq!(error.to_string(), "verifier layers: expected a size of 3, got 4");
+        assert!(fit([layer(9, 3), layer(6, 2), layer(2, 1)]).is_err());
+        assert!(fit([layer(6, 3), layer(6, 2), layer(4, 2)]).is_err());
+        assert!(Layer::new(vec![f32::NAN], vec![0.0]).is_err());
+        assert!(Layer::new(vec![1.0; 3], vec![0.0; 2]).is_err());
+        let flat = Standardisation { mean: vec![0.0; 2], deviation: vec![1.0, 0.0] };
+        assert!(Network::new(flat, [layer(6, 3), layer(6, 2), layer(2, 1)]).is_err());
+    }
+}

@@ -1,0 +1,253 @@
+//! One leased session of a server: numbered requests, each answered once, on a wire that may lose them.
+
+use std::time::Duration;
+
+use protocol::{Image, Open, Opening, Reply, Request, Reset, decode, encode};
+use tokio::sync::{mpsc, watch};
+use tokio::time::Instant;
+use zenoh::bytes::ZBytes;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::pubsub::{Publisher, Subscriber};
+use zenoh::qos::{CongestionControl, Reliability};
+
+use super::servers::Sign;
+use super::{EnvironmentFault, Episode, Network, Timing};
+
+/// Replies that may wait to be read: one that is awaited and late copies of it. More are dropped, for
+/// the server sends again what is asked again.
+const REPLIES_MAX: usize = 16;
+
+/// A session between episodes. Dropping it ends the session on the server.
+#[derive(Debug)]
+pub struct Environment {
+    server: String,
+    session: String,
+    image_height: usize,
+    image_width: usize,
+    timing: Timing,
+    /// Of the last request that was sent.
+    sequence: u64,
+    /// Times that the server's token had gone when the session was opened.
+    losses: u32,
+    signs: watch::Receiver<Sign>,
+    replies: mpsc::Receiver<ZBytes>,
+    publisher: Publisher<'static>,
+    _subscriber: Subscriber<()>,
+    _token: LivelinessToken,
+}
+
+impl Environment {
+    /// Leases a session of `server`.
+    pub async fn open(
+        network: &Network,
+        server: &str,
+        open: Open,
+    ) -> Result<Self, EnvironmentFault> {
+        let signs = network.servers.signs(server);
+        let losses = signs.borrow().losses;
+        let session = ask_for_session(network, server, &open).await?;
+        let (sender, replies) = mpsc::channel(REPLIES_MAX);
+        let keys = &network.keys;
+        let on_reply = move |sample: zenoh::sample::Sample| {
+            // A full channel holds late copies only; the reply that counts is asked for again.
+            let _ = sender.try_send(sample.payload().clone());
+        };
+        let subscriber = network
+            .session
+            .declare_subscriber(keys.reply(&session).map_err(EnvironmentFault::wire)?)
+            .callback(on_reply)
+            .await
+            .map_err(EnvironmentFault::wire)?;
+        let publisher = network
+            .session
+            .declare_publisher(keys.request(&session).map_err(EnvironmentFault::wire)?)
+            .congestion_control(CongestionControl::Block)
+            .reliability(Reliability::Reliable)
+            .express(true)
+            .await
+            .map_err(EnvironmentFault::wire)?;
+        let token = network
+            .session
+            .liveliness()
+            .declare_token(keys.session(&session).map_err(EnvironmentFault::wire)?)
+            .await
+            .map_err(EnvironmentFault::wire)?;
+        Ok(Self {
+            server: server.to_owned(),
+            session,
+            image_height: open.image_height as usize,
+            image_width: open.image_width as usize,
+            timing: network.timing,
+            sequence: 0,
+            losses,
+            signs,
+            replies,
+            publisher,
+            _subscriber: subscriber,
+            _token: token,
+        })
+    }
+
+    /// The server's id.
+    pub fn server(&self) -> &str {
+        &self.server
+    }
+
+    /// The session's id.
+    pub fn session(&self) -> &str {
+        &self.session
+    }
+
+    /// Starts an episode. An error gives the session up: open another one.
+    pub async fn reset(mut self, reset: Reset) -> Result<Episode, EnvironmentFault> {
+        let Reset { task, variant, configuration, seed } = reset;
+        let request = |sequence| Request::Reset { sequence, task, variant, configuration, seed };
+        match self.ask("Reset", request).await? {
+            Reply::Observed { observation, .. } => {
+                self.check_image(&observation.image)?;
+                Ok(Episode::new(self, observation))
+            }
+            other => Err(unexpected("Observed", &other)),
+        }
+    }
+
+    /// Ends the session and waits for the server's word on it.
+    pub async fn close(mut self) -> Result<(), EnvironmentFault> {
+        match self.ask("Close", |sequence| Request::Close { sequence }).await? {
+            Reply::Closed { .. } => Ok(()),
+            other => Err(unexpected("Closed", &other)),
+        }
+    }
+
+    pub(super) fn check_image(&self, image: &Image) -> Result<(), EnvironmentFault> {
+        if (image.height, image.width) == (self.image_height, self.image_width) {
+            return Ok(());
+        }
+        Err(EnvironmentFault::wire(format!(
+            "expected an image of {} x {} pixels, got {} x {}",
+            self.image_height, self.image_width, image.height, image.width
+        )))
+    }
+
+    /// Sends the next request until its reply comes; gives up when the server cannot give one.
+    pub(super) async fn ask(
+        &mut self,
+        asked: &'static str,
+        request: impl FnOnce(u64) -> Request,
+    ) -> Result<Reply, EnvironmentFault> {
+        let sequence = self.sequence + 1;
+        let bytes = encode(&request(sequence)).map_err(|error| EnvironmentFault::unsent(&error))?;
+        let bytes = ZBytes::from(bytes);
+        self.sequence = sequence;
+        let asked_at = Instant::now();
+        let mut resend = self.timing.resend;
+        loop {
+            self.check_server(asked, asked_at)?;
+            self.publisher.put(bytes.clone()).await.map_err(EnvironmentFault::wire)?;
+            if let Some(reply) = self.reply_within(resend, asked, asked_at).await? {
+                return match reply {
+                    Reply::Refused { reason, .. } => Err(EnvironmentFault::Refused { reason }),
+                    Reply::Faulted { kind, reason, .. } => {
+                        Err(EnvironmentFault::Faulted { kind, reason })
+                    }
+                    reply => Ok(reply),
+                };
+            }
+            resend = (resend * 2).min(self.timing.resend_max);
+        }
+    }
+
+    /// The reply to the last request, or none within `wait`. Late replies to earlier ones are dropped.
+    async fn reply_within(
+        &mut self,
+        wait: Duration,
+        asked: &'static str,
+        asked_at: Instant,
+    ) -> Result<Option<Reply>, EnvironmentFault> {
+        let deadline = Instant::now() + wait;
+        loop {
+            tokio::select! {
+                biased;
+                payload = self.replies.recv() => {
+                    let payload = payload.ok_or_else(|| EnvironmentFault::wire("the network is closed"))?;
+                    protocol::codec::check_size::<Reply>(payload.len()).map_err(EnvironmentFault::wire)?;
+                    let reply: Reply = decode(&payload.to_bytes()).map_err(EnvironmentFault::wire)?;
+                    // Number 0 is about the session itself, or about a request that could not be read.
+                    if reply.sequence() == self.sequence || reply.sequence() == 0 {
+                        return Ok(Some(reply));
+                    }
+                }
+                // An error here would mean that the network is gone; the next reply tells.
+                Ok(()) = self.signs.changed() => self.check_server(asked, asked_at)?,
+                () = tokio::time::sleep_until(deadline) => return Ok(None),
+            }
+        }
+    }
+
+    fn check_server(
+        &mut self,
+        asked: &'static str,
+        asked_at: Instant,
+    ) -> Result<(), EnvironmentFault> {
+        let sign = *self.signs.borrow_and_update();
+        if sign.losses != self.losses {
+            return Err(EnvironmentFault::ServerLost { server: self.server.clone() });
+        }
+        let waited = asked_at.elapsed();
+        // A server beats from its start on, but its first beat may not have come when a request goes out.
+        let silent = sign.beaten_at.map_or(waited, |beaten_at| beaten_at.elapsed().min(waited));
+        if silent > self.timing.silence_max || waited > self.timing.reply_max {
+            let waited_secs = waited.as_secs();
+            return Err(EnvironmentFault::TimedOut {
+                server: self.server.clone(),
+                asked,
+                waited_secs,
+            });
+        }
+        Ok(())
+    }
+}
+
+/// For a reply that does not belong to its request.
+pub(super) fn unexpected(expected: &str, reply: &Reply) -> EnvironmentFault {
+    EnvironmentFault::wire(format!("expected {expected}, got {}", reply.kind()))
+}
+
+async fn ask_for_session(
+    network: &Network,
+    server: &str,
+    open: &Open,
+) -> Result<String, EnvironmentFault> {
+    let asked_at = Instant::now();
+    let payload = encode(open).map_err(|error| EnvironmentFault::unsent(&error))?;
+    let key = network.keys.open(server).map_err(EnvironmentFault::wire)?;
+    let mut signs = network.servers.signs(server);
+    let losses = signs.borrow().losses;
+    let lost = signs.wait_for(|sign| sign.losses != losses);
+    let replies = network
+        .session
+        .get(key)
+        .payload(payload)
+        .timeout(network.timing.open_max)
+        .await
+        .map_err(EnvironmentFault::wire)?;
+    let reply = tokio::select! {
+        reply = replies.recv_async() => reply,
+        _ = lost => return Err(EnvironmentFault::ServerLost { server: server.to_owned() }),
+    };
+    let Ok(Ok(sample)) = reply.map(zenoh::query::Reply::into_result) else {
+        // zenoh says the same whether the time is over or nobody is there.
+        let waited_secs = asked_at.elapsed().as_secs();
+        return Err(EnvironmentFault::TimedOut {
+            server: server.to_owned(),
+            asked: "Open",
+            waited_secs,
+        });
+    };
+    protocol::codec::check_size::<Opening>(sample.payload().len())
+        .map_err(EnvironmentFault::wire)?;
+    match decode(&sample.payload().to_bytes()).map_err(EnvironmentFault::wire)? {
+        Opening::Opened { session } => Ok(session),
+        Opening::Refused { reason } => Err(EnvironmentFault::Refused { reason }),
+    }
+}

@@ -1,0 +1,165 @@
+//! One zenoh session: what it connects to, where it listens, and the servers that it sees.
+
+use std::net::{Ipv4Addr, TcpListener};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use protocol::{Description, Keys, limits};
+use zenoh::Session;
+
+use super::servers::Servers;
+
+/// Stands for a free port of this machine alone.
+const ANY_LOOPBACK_PORT: &str = "tcp/127.0.0.1:0";
+/// Another process may take a port between its choice and its use.
+const PORT_ATTEMPTS_MAX: usize = 10;
+/// A slow reader holds a message up that long before the link is given up.
+const CONGESTION_MICROSECONDS: u64 = 60_000_000;
+
+/// Where the network lies. Nothing is opened that is not named here.
+#[derive(Debug, Clone)]
+pub struct NetworkOptions {
+    /// Routers or servers elsewhere, as `tcp/host:port`.
+    pub connect: Vec<String>,
+    /// Endpoints that others may connect to; `tcp/127.0.0.1:0` takes a free port.
+    pub listen: Vec<String>,
+    /// Who meets whom.
+    pub fleet: String,
+    /// Find others on the local network by multicast; without `listen`, listens on every interface.
+    pub multicast: bool,
+    /// How long things may take.
+    pub timing: Timing,
+}
+
+/// How long things may take.
+#[derive(Debug, Clone, Copy)]
+pub struct Timing {
+    /// A request is sent again when no reply came for this long, then for twice as long, and so on.
+    pub resend: Duration,
+    /// The longest such wait.
+    pub resend_max: Duration,
+    /// A server whose heartbeat is silent for this long is stuck.
+    pub silence_max: Duration,
+    /// No reply takes longer than this, whatever the heartbeat says.
+    pub reply_max: Duration,
+    /// A session is opened within this time; the server may have to load a model first.
+    pub open_max: Duration,
+}
+
+/// A handle to one zenoh session; clones share it.
+#[derive(Debug, Clone)]
+pub struct Network {
+    pub(super) session: Session,
+    pub(super) keys: Keys,
+    pub(super) servers: Arc<Servers>,
+    pub(super) timing: Timing,
+    listening: Vec<String>,
+}
+
+impl Default for NetworkOptions {
+    /// Listens on a free port of the loopback interface.
+    fn default() -> Self {
+        Self {
+            connect: Vec::new(),
+            listen: vec![ANY_LOOPBACK_PORT.to_owned()],
+            fleet: "local".to_owned(),
+            multicast: false,
+            timing: Timing::default(),
+        }
+    }
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            resend: Duration::from_millis(500),
+            resend_max: Duration::from_secs(4),
+            silence_max: Duration::from_secs(15),
+            reply_max: Duration::from_secs(120),
+            open_max: Duration::from_secs(60),
+        }
+    }
+}
+
+impl Network {
+    /// Opens the session. Needs a tokio runtime with several threads.
+    pub async fn open(options: NetworkOptions) -> anyhow::Result<Self> {
+        let keys = Keys::new(&options.fleet)?;
+        let (session, listening) = open_session(&options).await?;
+        let servers = Servers::watch(&session, &keys).await?;
+        Ok(Self { session, keys, servers, timing: options.timing, listening })
+    }
+
+    /// The endpoints that servers can connect to, free ports filled in.
+    pub fn listening(&self) -> &[String] {
+        &self.listening
+    }
+
+    /// Waits until `count` servers live and have described themselves, or until `wait` is over.
+    /// Returns all that have, in the order of their ids.
+    pub async fn servers(&self, count: usize, wait: Duration) -> Vec<Description> {
+        self.servers.described(&self.session, &self.keys, count, wait).await
+    }
+
+    /// Ends the session; whoever watches this agent's tokens sees it at once.
+    pub async fn close(self) -> anyhow::Result<()> {
+        self.session.close().await.map_err(|error| anyhow!("cannot close the network: {error}"))
+    }
+}
+
+async fn open_session(options: &NetworkOptions) -> anyhow::Result<(Session, Vec<String>)> {
+    let mut attempt = 1;
+    loop {
+        let listening = with_ports(&options.listen)?;
+        let configuration = configuration(options, &listening)?;
+        match zenoh::open(configuration).await {
+            Ok(session) => return Ok((session, listening)),
+            Err(error) if listening == options.listen || attempt == PORT_ATTEMPTS_MAX => {
+                return Err(anyhow!("cannot open the network listening on {listening:?}: {error}"));
+            }
+            Err(_) => attempt += 1,
+        }
+    }
+}
+
+fn with_ports(endpoints: &[String]) -> anyhow::Result<Vec<String>> {
+    let filled = |endpoint: &String| {
+        if endpoint != ANY_LOOPBACK_PORT {
+            return Ok(endpoint.clone());
+        }
+        let listener =
+            TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).context("no free port on 127.0.0.1")?;
+        Ok(format!("tcp/{}", listener.local_addr().context("a bound listener has an address")?))
+    };
+    endpoints.iter().map(filled).collect()
+}
+
+fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Result<zenoh::Config> {
+    let rx_bytes_max = limits::MESSAGE_BYTES_MAX + 65_536;
+    let entries = [
+        ("mode", "\"peer\"".to_owned()),
+        ("connect/endpoints", serde_json::to_string(&options.connect)?),
+        ("listen/endpoints", serde_json::to_string(listening)?),
+        ("scouting/multicast/enabled", options.multicast.to_string()),
+        ("scouting/gossip/enabled", options.multicast.to_string()),
+        // The caches of outcomes and verifiers order their samples by time.
+        ("timestamping/enabled", "true".to_owned()),
+        ("transport/link/rx/max_message_size", rx_bytes_max.to_string()),
+        (
+            "transport/link/tx/queue/congestion_control/block/wait_before_close",
+            CONGESTION_MICROSECONDS.to_string(),
+        ),
+    ];
+    let mut configuration = zenoh::Config::default();
+    for (key, value) in entries {
+        // Left out, this is a free port on every interface: what others find by multicast.
+        if key == "listen/endpoints" && listening.is_empty() && options.multicast {
+            continue;
+        }
+        configuration
+            .insert_json5(key, &value)
+            .map_err(|error| anyhow!("zenoh does not take {key} = {value}: {error}"))?;
+    }
+    Ok(configuration)
+}

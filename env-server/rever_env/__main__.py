@@ -1,0 +1,92 @@
+"""Command line: expert (success table), demonstrate (training episodes), serve, health."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from rever_env import health, serving
+
+
+def main() -> int:
+    """Parses, calls one library function, prints one error, returns the exit status."""
+    # MuJoCo reads its OpenGL backend from the environment when it is first imported.
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    arguments = _parser().parse_args()
+    from rever_env.fault import Fault
+
+    try:
+        return int(arguments.run(arguments))
+    except Fault as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="rever_env", description=__doc__)
+    commands = parser.add_subparsers(required=True)
+
+    expert = commands.add_parser("expert", help="measure the scripted expert's success")
+    _add_tasks(expert)
+    expert.add_argument("--episodes", type=int, default=200, help="random placements per task")
+    expert.add_argument("--seed", type=int, default=4_000_000_000)
+    expert.add_argument("--processes", type=int, default=2)
+    expert.set_defaults(run=_expert)
+
+    demonstrate = commands.add_parser("demonstrate", help="record expert episodes for training")
+    _add_tasks(demonstrate)
+    demonstrate.add_argument("--episodes", type=int, required=True, help="per task")
+    demonstrate.add_argument("--seed", type=int, default=0, help="first seed")
+    demonstrate.add_argument("--out", type=Path, required=True)
+    demonstrate.add_argument("--noise", action="store_true", help="inject noise into the actions")
+    demonstrate.add_argument("--processes", type=int, default=2)
+    demonstrate.set_defaults(run=_demonstrate)
+
+    serve = commands.add_parser("serve", help="offer the worlds over zenoh")
+    serving.add_arguments(serve)
+
+    check = commands.add_parser("health", help="ask servers whether they still work")
+    health.add_arguments(check)
+    return parser
+
+
+def _add_tasks(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="default: all")
+
+
+def _demonstrate(arguments: argparse.Namespace) -> int:
+    from rever_env import demonstrations, tasks
+
+    counts = demonstrations.demonstrate(
+        tasks.choose(tasks.load(), arguments.tasks),
+        arguments.episodes,
+        arguments.seed,
+        arguments.out,
+        noisy=arguments.noise,
+        processes=arguments.processes,
+        report=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    for name, (kept, failed) in counts.items():
+        print(f"{name}: {kept} kept, {failed} failed")
+    return 0
+
+
+def _expert(arguments: argparse.Namespace) -> int:
+    from rever_env import measurement, tasks
+
+    rows = measurement.measure(
+        tasks.choose(tasks.load(), arguments.tasks),
+        arguments.episodes,
+        arguments.seed,
+        processes=arguments.processes,
+        report=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    print(measurement.table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

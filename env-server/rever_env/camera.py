@@ -1,0 +1,117 @@
+"""The camera: RGB images and visible-pixel masks from an offscreen OpenGL context."""
+
+import weakref
+from types import TracebackType
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rever_env.fault import RendererUnavailable
+
+Image = NDArray[np.uint8]
+_GEOMS_MAX = 200
+
+
+class Camera:
+    """Renders one fixed camera; the model, not the image's shape, sets its field of view."""
+
+    def __init__(self, model: mujoco.MjModel, name: str, height: int, width: int) -> None:
+        self._model = model
+        self._height = height
+        self._width = width
+        try:
+            self._context: Any = mujoco.GLContext(width, height)
+            self._context.make_current()
+            self._renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        except Exception as error:  # the binding raises whatever its backend raises
+            raise RendererUnavailable(
+                f"renderer for {height} x {width} images: expected an offscreen OpenGL context, "
+                f"got {type(error).__name__}: {error}"
+            ) from error
+        # Freed at the latest before the interpreter ends, while the display still exists.
+        self._release = weakref.finalize(self, _release, self._context, self._renderer)
+        mujoco.mjr_resizeOffscreen(width, height, self._renderer)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._renderer)
+        self._scene = mujoco.MjvScene(model, maxgeom=_GEOMS_MAX)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = 0
+        self._option = mujoco.MjvOption()
+        self._view = mujoco.MjvCamera()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.fixedcamid = model.camera(name).id
+        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+
+    def image(self, data: mujoco.MjData) -> Image:
+        """RGB, uint8 (height, width, 3)."""
+        self._update(data)
+        return self._read()
+
+    def bodies(self, data: mujoco.MjData) -> NDArray[np.int32]:
+        """Body id seen at each pixel, int32 (height, width); -1 where the background is."""
+        self._update(data)
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
+        flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
+        pixels = self._read().astype(np.int32)
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 0
+        flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
+        # Colour 0 is the background, colour k + 1 the scene's geom with segmentation id k.
+        codes = pixels[..., 0] + 256 * pixels[..., 1] + 65536 * pixels[..., 2]
+        body_of_code = np.full(self._scene.ngeom + 2, -1, dtype=np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
+                body_of_code[geom.segid + 1] = self._model.geom_bodyid[geom.objid]
+        seen: NDArray[np.int32] = body_of_code[codes]
+        return seen
+
+    def project(self, data: mujoco.MjData, point: NDArray[np.float64]) -> tuple[float, float]:
+        """Image coordinates (x right, y down) of a world point, each 0 to 1 inside the image."""
+        index = self._view.fixedcamid
+        axes = data.cam_xmat[index].reshape(3, 3)
+        local = axes.T @ (point - data.cam_xpos[index])
+        depth = max(-float(local[2]), 1e-6)
+        focal, sensor = self._model.cam_intrinsic[index], self._model.cam_sensorsize[index]
+        x = 0.5 + float(focal[0]) * float(local[0]) / depth / float(sensor[0])
+        y = 0.5 - float(focal[1]) * float(local[1]) / depth / float(sensor[1])
+        return x, y
+
+    def close(self) -> None:
+        self._release()
+
+    def __enter__(self) -> "Camera":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _update(self, data: mujoco.MjData) -> None:
+        # Several worlds may live in one process: each makes its own context current first.
+        self._context.make_current()
+        mujoco.mjv_updateScene(
+            self._model,
+            data,
+            self._option,
+            None,
+            self._view,
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
+
+    def _read(self) -> Image:
+        mujoco.mjr_render(self._rectangle, self._scene, self._renderer)
+        image = np.empty((self._height, self._width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(image, None, self._rectangle, self._renderer)
+        return np.ascontiguousarray(image[::-1])  # OpenGL's rows start at the bottom
+
+
+def _release(context: Any, renderer: mujoco.MjrContext) -> None:
+    context.make_current()
+    renderer.free()
+    context.free()

@@ -1,0 +1,21 @@
+"""What can go wrong in the world: each fault is its own type and never a reward."""
+
+
+class Fault(RuntimeError):
+    """The world cannot go on; the episode has no outcome."""
+
+
+class PhysicsDiverged(Fault):
+    """Positions or velocities became non-finite or impossibly large."""
+
+
+class RendererUnavailable(Fault):
+    """No OpenGL context could be made."""
+
+
+class InvalidAction(Fault):
+    """The action has the wrong shape, is not finite, or comes when no step is allowed."""
+
+
+class InvalidPlacement(Fault):
+    """The configuration or seed is out of range, or no free placement was found."""

@@ -1,0 +1,116 @@
+"""The Gymnasium environments: one id per task, the same world behind each."""
+
+from dataclasses import asdict
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rever_env import tasks
+from rever_env.world import Observation, World
+
+_RANDOM_SEEDS = 1_000_000_000  # seeds drawn by reset(seed=None) lie below this
+
+# x y z (m, base frame), roll pitch yaw (rad), pad, gripper opening.
+_STATE_HIGH = np.array([2.0, 2.0, 2.0, np.pi, np.pi, np.pi, 1.0, 1.0], np.float32)
+_STATE_LOW = np.array([-2.0, -2.0, -2.0, -np.pi, -np.pi, -np.pi, 0.0, 0.0], np.float32)
+
+
+class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
+    """A task as a Gymnasium environment.
+
+    observation: image uint8 (height, width, 3), state float32 (8,) in Bridge's order,
+    instruction text. action: float64 (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open).
+    reset options: {"configuration": 0..23} for a fixed placement; otherwise the seed draws one.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
+
+    def __init__(
+        self,
+        task: str,
+        render_mode: str | None = "rgb_array",
+        image_height: int = 128,
+        image_width: int = 128,
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render mode: expected None or 'rgb_array', got {render_mode!r}")
+        self.render_mode = render_mode
+        description = tasks.load()[task]
+        self.world = World(description, image_height, image_width)
+        self._last: Observation | None = None
+        characters = "".join(sorted(set(description.instruction)))
+        self.observation_space = spaces.Dict(
+            {
+                "image": spaces.Box(0, 255, (image_height, image_width, 3), np.uint8),
+                "state": spaces.Box(_STATE_LOW, _STATE_HIGH),
+                "instruction": spaces.Text(
+                    max_length=len(description.instruction), charset=characters
+                ),
+            }
+        )
+        # SIMPLER allows turns up to pi / 2; 1 rad in 0.2 s is plenty and normalises the space.
+        self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float64)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        super().reset(seed=seed)
+        options = options or {}
+        unknown = set(options) - {"configuration"}
+        if unknown:
+            raise ValueError(f"reset options: expected only 'configuration', got {sorted(unknown)}")
+        placement_seed = seed if seed is not None else self._drawn_seed()
+        self._last = self.world.reset(
+            configuration=options.get("configuration"), seed=placement_seed
+        )
+        return _fields(self._last), {"seed": placement_seed}
+
+    def step(
+        self, action: NDArray[np.float64]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        transition = self.world.step(action)
+        self._last = transition.observation
+        return (
+            _fields(self._last),
+            transition.reward,
+            transition.terminated,
+            transition.truncated,
+            asdict(transition.statistics),
+        )
+
+    def render(self) -> NDArray[np.uint8] | None:
+        if self.render_mode is None or self._last is None:
+            return None
+        return self._last.image
+
+    def close(self) -> None:
+        self.world.close()
+
+    def _drawn_seed(self) -> int:
+        return int(self.np_random.integers(_RANDOM_SEEDS))
+
+
+def register() -> None:
+    """Registers every task's id; importing this module does it."""
+    for task in tasks.load().values():
+        if task.gymnasium_id not in gymnasium.registry:
+            gymnasium.register(
+                id=task.gymnasium_id,
+                entry_point="rever_env.gymnasium_env:BridgeEnv",
+                kwargs={"task": task.name},
+                max_episode_steps=task.steps_max,
+            )
+
+
+def _fields(observation: Observation) -> dict[str, Any]:
+    return {
+        "image": observation.image,
+        "state": observation.state,
+        "instruction": observation.instruction,
+    }
+
+
+register()

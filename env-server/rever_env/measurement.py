@@ -1,0 +1,164 @@
+"""Measures the scripted expert: last-step success per task, clean and with injected noise."""
+
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+from rever_env.demonstrations import Noise
+from rever_env.tasks import Task
+from rever_env.world import World
+
+_CHUNK = 10  # episodes per unit of work
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Some episodes of one task and suite for one process."""
+
+    task: Task
+    suite: str  # "grid", "random" or "random, noise"
+    configurations: tuple[int | None, ...]
+    seeds: tuple[int, ...]
+
+
+@dataclass
+class Row:
+    """Counts of one task and suite."""
+
+    task: str
+    suite: str
+    episodes: int = 0
+    successes: int = 0  # at the last step of the horizon
+    released: int = 0
+    grasped: int = 0
+    steps_to_release: int = 0  # summed over the episodes that were ever released
+    ever_released: int = 0
+    worst_steps: int = 0
+    seconds: float = 0.0
+    steps: int = 0
+    failed: tuple[int, ...] = ()
+
+
+def measure(
+    tasks: list[Task],
+    episodes: int,
+    seed: int,
+    *,
+    processes: int,
+    report: Callable[[str], None],
+) -> list[Row]:
+    """All 24 configurations, and random placements with and without noise."""
+    chunks: list[Chunk] = []
+    for task in tasks:
+        grid = tuple(range(len(task.configurations)))
+        chunks.append(Chunk(task, "grid", grid, (0,) * len(grid)))
+        for suite in ("random", "random, noise"):
+            for start in range(0, episodes, _CHUNK):
+                seeds = tuple(range(seed + start, seed + min(start + _CHUNK, episodes)))
+                chunks.append(Chunk(task, suite, (None,) * len(seeds), seeds))
+    rows: dict[tuple[str, str], Row] = {}
+    for chunk in chunks:
+        key = chunk.task.name, chunk.suite
+        rows.setdefault(key, Row(*key))
+    started = time.monotonic()
+    total = sum(len(chunk.seeds) for chunk in chunks)
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(run, chunk) for chunk in chunks]):
+            part = future.result()
+            _add(rows[part.task, part.suite], part)
+            done = sum(row.episodes for row in rows.values())
+            seconds = time.monotonic() - started
+            report(
+                f"{done} of {total} episodes, about {(total - done) * seconds / done:.0f} s left"
+            )
+    return list(rows.values())
+
+
+def run(chunk: Chunk) -> Row:
+    """The episodes of one chunk; each runs to its horizon, as SIMPLER's last-step rule asks."""
+    row = Row(chunk.task.name, chunk.suite)
+    # The images are not looked at: a tiny one keeps rendering cheap.
+    with World(chunk.task, image_height=8, image_width=8) as world:
+        started = time.perf_counter()
+        for configuration, seed in zip(chunk.configurations, chunk.seeds, strict=True):
+            _episode(world, chunk, configuration, seed, row)
+        row.seconds = time.perf_counter() - started
+    return row
+
+
+def table(rows: list[Row]) -> str:
+    """A text table with Wilson intervals (95 %)."""
+    head = ("task", "suite", "success", "95 % interval", "released", "grasped", "release step")
+    lines = [head]
+    for row in rows:
+        low, high = wilson(row.successes, row.episodes)
+        mean = row.steps_to_release / max(row.ever_released, 1)
+        lines.append(
+            (
+                row.task,
+                row.suite,
+                f"{row.successes}/{row.episodes}",
+                f"{low:.3f}-{high:.3f}",
+                f"{row.released}",
+                f"{row.grasped}",
+                f"mean {mean:.1f}, worst {row.worst_steps}",
+            )
+        )
+        if row.failed:
+            lines.append((f"  failed: {', '.join(map(str, row.failed))}",) + ("",) * 6)
+    widths = [max(len(line[column]) for line in lines if line[1]) for column in range(len(head))]
+    text = [
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    ]
+    milliseconds = 1e3 * sum(row.seconds for row in rows) / max(sum(row.steps for row in rows), 1)
+    return "\n".join([*text, f"{milliseconds:.2f} ms per control step with expert, tiny images"])
+
+
+def wilson(successes: int, episodes: int) -> tuple[float, float]:
+    """Wilson's score interval at 95 %."""
+    if episodes == 0:
+        return 0.0, 1.0
+    z = 1.959963984540054
+    share = successes / episodes
+    centre = share + z * z / (2 * episodes)
+    spread = z * math.sqrt(share * (1 - share) / episodes + z * z / (4 * episodes**2))
+    scale = 1 + z * z / episodes
+    return max((centre - spread) / scale, 0.0), min((centre + spread) / scale, 1.0)
+
+
+def _episode(world: World, chunk: Chunk, configuration: int | None, seed: int, row: Row) -> None:
+    world.reset(configuration=configuration, seed=seed)
+    noise = Noise(seed, chunk.task) if chunk.suite == "random, noise" else None
+    released_at = None
+    while True:
+        decision = world.expert_decision()
+        transition = world.step(noise.apply(decision) if noise else decision.action)
+        row.steps += 1
+        if transition.statistics.released_success and released_at is None:
+            released_at = world.steps
+        if transition.truncated:
+            break
+    row.episodes += 1
+    row.successes += transition.statistics.is_success
+    row.released += transition.statistics.released_success
+    row.grasped += transition.statistics.ever_grasped
+    if released_at is not None:
+        row.ever_released += 1
+        row.steps_to_release += released_at
+        row.worst_steps = max(row.worst_steps, released_at)
+    if not transition.statistics.is_success:
+        row.failed += (configuration if configuration is not None else seed,)
+
+
+def _add(row: Row, part: Row) -> None:
+    for name in ("episodes", "successes", "released", "grasped", "steps_to_release"):
+        setattr(row, name, getattr(row, name) + getattr(part, name))
+    row.ever_released += part.ever_released
+    row.worst_steps = max(row.worst_steps, part.worst_steps)
+    row.seconds += part.seconds
+    row.steps += part.steps
+    row.failed += part.failed

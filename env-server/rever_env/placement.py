@@ -1,0 +1,100 @@
+"""Placements: the 24 configurations, and random ones that stay clear of them."""
+
+import math
+from dataclasses import dataclass
+
+from rever_env.fault import InvalidPlacement
+from rever_env.tasks import Placement, Task
+
+_MASK = (1 << 64) - 1
+_DRAWS_MAX = 10_000
+SEED_LIMIT = 1 << 53  # seeds stay exact in a double
+
+
+@dataclass
+class SplitMix64:
+    """Steele, Lea and Flood's generator: one 64-bit word of state, the same in every language."""
+
+    state: int
+
+    def next_word(self) -> int:
+        self.state = (self.state + 0x9E3779B97F4A7C15) & _MASK
+        word = self.state
+        word = ((word ^ (word >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+        word = ((word ^ (word >> 27)) * 0x94D049BB133111EB) & _MASK
+        return word ^ (word >> 31)
+
+    def uniform(self, low: float, high: float) -> float:
+        """low + (high - low) * u with u in [0, 1) on a grid of 2^-53."""
+        return low + (high - low) * ((self.next_word() >> 11) * 2.0**-53)
+
+
+def place(task: Task, configuration: int | None, seed: int) -> Placement:
+    """The placement of one reset: a grid configuration, or a draw from the seed."""
+    if not 0 <= seed < SEED_LIMIT:
+        raise InvalidPlacement(f"seed {seed}: expected 0 <= seed < 2^53")
+    if configuration is None:
+        return _draw(task, seed)
+    if not 0 <= configuration < len(task.configurations):
+        raise InvalidPlacement(
+            f"configuration {configuration}: expected 0 <= configuration < "
+            f"{len(task.configurations)} for task {task.name}"
+        )
+    return task.configurations[configuration]
+
+
+def near_configuration(task: Task, placement: Placement) -> bool:
+    """Whether source, target and yaw are all within the excluded distance of one configuration."""
+    ranges = task.random
+    radius = ranges.exclusion_radius
+    return any(
+        _distance(
+            placement.source_x - grid.source_x,
+            placement.source_y - grid.source_y,
+        )
+        <= radius
+        and _distance(placement.target_x - grid.target_x, placement.target_y - grid.target_y)
+        <= radius
+        and _turn(placement.source_yaw - grid.source_yaw) <= ranges.exclusion_yaw
+        for grid in task.configurations
+    )
+
+
+def _draw(task: Task, seed: int) -> Placement:
+    ranges = task.random
+    generator = SplitMix64(_fnv1a(task.name) ^ seed)
+    for _ in range(_DRAWS_MAX):
+        placement = Placement(
+            source_x=generator.uniform(*ranges.source_x),
+            source_y=generator.uniform(*ranges.source_y),
+            source_yaw=generator.uniform(*ranges.source_yaw),
+            target_x=generator.uniform(*ranges.target_x),
+            target_y=generator.uniform(*ranges.target_y),
+        )
+        apart = _distance(
+            placement.source_x - placement.target_x, placement.source_y - placement.target_y
+        )
+        if apart >= ranges.separation_min and not near_configuration(task, placement):
+            return placement
+    raise InvalidPlacement(
+        f"task {task.name}, seed {seed}: no free placement in {_DRAWS_MAX} draws"
+    )
+
+
+def _fnv1a(text: str) -> int:
+    """64-bit FNV-1a: mixes the task's name into the stream, so that tasks do not share draws."""
+    digest = 0xCBF29CE484222325
+    for byte in text.encode():
+        digest = ((digest ^ byte) * 0x100000001B3) & _MASK
+    return digest
+
+
+def _distance(x: float, y: float) -> float:
+    # Square root of plain products: correctly rounded, so equal in every language (hypot is not).
+    return math.sqrt(x * x + y * y)
+
+
+def _turn(degrees: float) -> float:
+    """The angle between two headings, 0 to 180 degrees."""
+    wrapped = math.fmod(abs(degrees), 360.0)
+    return min(wrapped, 360.0 - wrapped)

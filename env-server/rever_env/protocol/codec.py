@@ -1,0 +1,281 @@
+"""Messages to bytes and back, strictly: a body is read only when every byte of it is meant.
+
+A message is a frozen dataclass with a method validate; its annotations say how fields lie on the
+wire. int: unsigned, 64 bits unless annotated; float: 32 bits; tuples of floats: exactly as long as
+annotated. The order of a map's entries is free when reading and the dataclass's when writing.
+"""
+
+import dataclasses
+import enum
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, Generic, Protocol, TypeVar, Union
+
+import msgpack
+
+from rever_env.protocol import structure
+
+Reader = Callable[[object], Any]
+Writer = Callable[[Any], object]
+
+
+class CodecError(ValueError):
+    """A message was not written or not read."""
+
+
+class TooLarge(CodecError):
+    """Beyond the message's size limit; nothing was decoded."""
+
+
+class Malformed(CodecError):
+    """The bytes are not this message."""
+
+
+class Invalid(CodecError):
+    """The bytes are this message, but a value in it is out of bounds. message: what was read."""
+
+    def __init__(self, reason: str, message: Any = None) -> None:
+        super().__init__(reason)
+        self.message = message
+
+
+@dataclasses.dataclass(frozen=True)
+class Bits:
+    """Annotation of an int: how wide it may be."""
+
+    count: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Length:
+    """Annotation of a tuple of floats: how many there are."""
+
+    count: int
+
+
+class Message(Protocol):
+    """Any message."""
+
+    def validate(self) -> None:
+        """Raises ValueError that names the field, what was expected and what came."""
+
+
+M = TypeVar("M", bound=Message)
+
+
+class Codec(Generic[M]):
+    """Writes and reads one kind of message, or one of several variants under their names."""
+
+    def __init__(
+        self,
+        name: str,
+        bytes_max: int,
+        content: type[M] | Mapping[str, type[M]],
+        recognise: Callable[[object], None] | None = None,
+    ) -> None:
+        self.name = name
+        self.bytes_max = bytes_max
+        self._recognise = recognise
+        self._reader: Reader
+        self._writer: Writer
+        if isinstance(content, type):
+            self._reader, self._writer = _dataclass(content)
+        else:
+            self._reader, self._writer = _variants(content)
+
+    def encode(self, message: M) -> bytes:
+        """Bytes of message; an invalid one is refused here, so that a peer never sees it."""
+        self._validate(message)
+        data: bytes = msgpack.packb(self._writer(message), use_single_float=True)
+        self.check_size(len(data))
+        return data
+
+    def decode(self, data: bytes) -> M:
+        """The message in exactly these bytes."""
+        self.check_size(len(data))
+        try:
+            structure.check(data)
+            value = msgpack.unpackb(data, object_pairs_hook=_once)
+        except UnicodeDecodeError as error:
+            raise Malformed(f"{self.name} cannot be read: text is not utf-8: {error}") from None
+        except ValueError as error:
+            raise Malformed(f"{self.name} cannot be read: {error}") from None
+        if self._recognise is not None:
+            try:
+                self._recognise(value)
+            except ValueError as error:
+                raise Invalid(f"{self.name} is invalid: {error}") from None
+        try:
+            message: M = self._reader(value)
+        except ValueError as error:
+            raise Malformed(f"{self.name} cannot be read: {error}") from None
+        self._validate(message)
+        return message
+
+    def check_size(self, count: int) -> None:
+        """Refuses a message by its size alone, for those who hold bytes not yet copied."""
+        if count > self.bytes_max:
+            raise TooLarge(f"{self.name} has {count} bytes, limit {self.bytes_max}")
+
+    def _validate(self, message: M) -> None:
+        try:
+            message.validate()
+        except ValueError as error:
+            raise Invalid(f"{self.name} is invalid: {error}", message) from None
+
+
+def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    entries = dict(pairs)
+    if len(entries) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"duplicate field `{twice}`")
+    return entries
+
+
+def _variants(content: Mapping[str, type[Any]]) -> tuple[Reader, Writer]:
+    readers = {name: _dataclass(variant)[0] for name, variant in content.items()}
+    writers = {variant: (name, _dataclass(variant)[1]) for name, variant in content.items()}
+
+    def read(value: object) -> Any:
+        if not isinstance(value, dict) or len(value) != 1:
+            raise ValueError(f"expected a map of one message, got {_kind(value)}")
+        ((name, fields),) = value.items()
+        reader = readers.get(name)
+        if reader is None:
+            raise ValueError(f"unknown variant `{name}`, expected {_choice(list(readers))}")
+        return reader(fields)
+
+    def write(message: Any) -> object:
+        name, writer = writers[type(message)]
+        return {name: writer(message)}
+
+    return read, write
+
+
+def _dataclass(kind: type[Any]) -> tuple[Reader, Writer]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    names = [field.name for field in dataclasses.fields(kind)]
+    fields = [(name, *_field(hints[name])) for name in names]
+    expected = set(names)
+
+    def read(value: object) -> Any:
+        if not isinstance(value, dict):
+            raise ValueError(f"invalid type: {_kind(value)}, expected a map")
+        if value.keys() != expected:
+            for name in value:
+                if name not in expected:
+                    raise ValueError(f"unknown field `{name}`, expected {_choice(names)}")
+            missing = next(name for name in names if name not in value)
+            raise ValueError(f"missing field `{missing}`")
+        return kind(*[reader(value[name]) for name, reader, _ in fields])
+
+    def write(message: Any) -> object:
+        return {name: writer(getattr(message, name)) for name, _, writer in fields}
+
+    return read, write
+
+
+def _field(hint: Any) -> tuple[Reader, Writer]:
+    annotations: tuple[object, ...] = ()
+    if typing.get_origin(hint) is typing.Annotated:
+        annotations = hint.__metadata__
+        hint = typing.get_args(hint)[0]
+    origin = typing.get_origin(hint)
+    if origin in (Union, types.UnionType):
+        # Annotated[X, ...] | None keeps its annotation inside.
+        (present,) = (part for part in typing.get_args(hint) if part is not type(None))
+        reader, writer = _field(present)
+        return (
+            lambda value: None if value is None else reader(value),
+            lambda value: None if value is None else writer(value),
+        )
+    if origin is tuple and typing.get_args(hint)[0] is float:
+        (length,) = (part.count for part in annotations if isinstance(part, Length))
+        return _floats(length), list
+    if origin is tuple:
+        return _tuple(*_field(typing.get_args(hint)[0]))
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return _dataclass(hint)
+    if hint is int:
+        bits = next((part.count for part in annotations if isinstance(part, Bits)), 64)
+        return _integer(bits), lambda value: value
+    if isinstance(hint, type) and issubclass(hint, enum.Enum):
+        return _enumeration(hint), lambda value: value.value
+    return _exactly(hint), lambda value: value
+
+
+def _integer(bits: int) -> Reader:
+    end = 1 << bits
+
+    def read(value: object) -> int:
+        if type(value) is not int:
+            raise ValueError(f"invalid type: {_kind(value)}, expected u{bits}")
+        if not 0 <= value < end:
+            raise ValueError(f"invalid value: integer `{value}`, expected u{bits}")
+        return value
+
+    return read
+
+
+def _floats(length: int) -> Reader:
+    expected = f"expected an array of {length} f32"
+
+    def read(value: object) -> tuple[float, ...]:
+        if type(value) is not list:
+            raise ValueError(f"invalid type: {_kind(value)}, {expected}")
+        if len(value) != length:
+            raise ValueError(f"invalid length {len(value)}, {expected}")
+        for element in value:
+            if type(element) is not float:
+                raise ValueError(f"invalid type: {_kind(element)}, expected f32")
+        return tuple(value)
+
+    return read
+
+
+def _tuple(reader: Reader, writer: Writer) -> tuple[Reader, Writer]:
+    def read(value: object) -> tuple[Any, ...]:
+        if type(value) is not list:
+            raise ValueError(f"invalid type: {_kind(value)}, expected a sequence")
+        return tuple(reader(element) for element in value)
+
+    return read, lambda value: [writer(element) for element in value]
+
+
+def _enumeration(kind: type[enum.Enum]) -> Reader:
+    members = {member.value: member for member in kind}
+
+    def read(value: object) -> enum.Enum:
+        if not isinstance(value, str) or value not in members:
+            raise ValueError(f"unknown variant `{value}`, expected {_choice(list(members))}")
+        return members[value]
+
+    return read
+
+
+def _exactly(kind: type[Any]) -> Reader:
+    expected = {bool: "a boolean", str: "a string", bytes: "bytes", float: "f32"}[kind]
+
+    def read(value: object) -> Any:
+        if type(value) is not kind:
+            raise ValueError(f"invalid type: {_kind(value)}, expected {expected}")
+        return value
+
+    return read
+
+
+def _choice(names: list[str]) -> str:
+    quoted = [f"`{name}`" for name in names]
+    if len(quoted) <= 2:
+        return " or ".join(quoted)
+    return "one of " + ", ".join(quoted)
+
+
+def _kind(value: object) -> str:
+    if value is None:
+        return "nil"
+    names = {bool: "boolean", int: "integer", float: "float", str: "string", bytes: "bytes"}
+    names.update({list: "sequence", dict: "map"})
+    return names.get(type(value), type(value).__name__)

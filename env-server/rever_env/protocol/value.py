@@ -1,0 +1,73 @@
+"""Types and checks of single values, worded once for every message."""
+
+import math
+from typing import Annotated
+
+from rever_env.protocol import limits
+from rever_env.protocol.codec import Bits, Length
+from rever_env.protocol.keys import PROTOCOL_VERSION
+
+U32 = Annotated[int, Bits(32)]
+Action = Annotated[tuple[float, ...], Length(limits.ACTION_LENGTH)]
+State = Annotated[tuple[float, ...], Length(limits.STATE_LENGTH)]
+
+
+class Numbered:
+    """A message with a number in its session: 1, 2, 3 and so on."""
+
+    sequence: int
+
+    def validate(self) -> None:
+        """Raises ValueError that names the field, what was expected and what came."""
+        sequence(self.sequence, 1)
+
+
+def name(field: str, value: str) -> None:
+    """A name: not empty, not long."""
+    count = len(value.encode())
+    if not 1 <= count <= limits.NAME_BYTES_MAX:
+        raise ValueError(f"{field}: expected 1 to {limits.NAME_BYTES_MAX} bytes, got {count}")
+
+
+def text(field: str, value: str) -> None:
+    """A text: not long."""
+    count = len(value.encode())
+    if count > limits.TEXT_BYTES_MAX:
+        raise ValueError(f"{field}: expected at most {limits.TEXT_BYTES_MAX} bytes, got {count}")
+
+
+def elements(field: str, length: int) -> None:
+    """A list that a peer may loop over."""
+    if length > limits.ELEMENTS_MAX:
+        raise ValueError(f"{field}: expected at most {limits.ELEMENTS_MAX} elements, got {length}")
+
+
+def finite(field: str, values: tuple[float, ...]) -> None:
+    """Numbers without NaN and infinity."""
+    for index, number in enumerate(values):
+        if not math.isfinite(number):
+            raise ValueError(f"{field}: expected finite numbers, got {number} at index {index}")
+
+
+def range(field: str, value: int, low: int, high: int) -> None:
+    """A whole number from low to high, both included."""
+    if not low <= value <= high:
+        raise ValueError(f"{field}: expected {low} to {high}, got {value}")
+
+
+def sequence(value: int, low: int) -> None:
+    """A request's number; 0 stands in a reply to a request that could not be read."""
+    range("sequence", value, low, limits.SEED_END - 1)
+
+
+def protocol(version: int) -> None:
+    """The version of the peer."""
+    if version != PROTOCOL_VERSION:
+        raise ValueError(f"expected protocol {PROTOCOL_VERSION}, got protocol {version}")
+
+
+def recognise_protocol(content: object) -> None:
+    """The version of a peer whose message may have other fields than ours."""
+    version = content.get("protocol") if isinstance(content, dict) else None
+    if type(version) is int:
+        protocol(version)

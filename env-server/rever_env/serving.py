@@ -1,0 +1,123 @@
+"""The serve subcommand: its arguments, the network it opens, and how it ends."""
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+from dataclasses import dataclass
+
+from rever_env.protocol import limits
+
+_FINISH_SECS_MAX = 10.0  # a wedged simulation is given up after that
+_PARENT_POLL_SECS = 0.5
+_CONGESTION_MICROSECONDS = 60_000_000  # a slow reader holds a reply up; it does not cost the link
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the arguments of serve."""
+    parser.add_argument(
+        "--connect", action="append", default=[], metavar="ENDPOINT", help="tcp/127.0.0.1:7447"
+    )
+    parser.add_argument("--listen", action="append", default=[], metavar="ENDPOINT")
+    parser.add_argument(
+        "--multicast",
+        action="store_true",
+        help="find others by multicast; without --listen, on every interface",
+    )
+    parser.add_argument("--fleet", default="local", help="who meets whom (default: local)")
+    parser.add_argument("--sessions", type=int, default=16, help="at once (default: 16)")
+    parser.add_argument(
+        "--idle-secs", type=int, default=600, help="a session without requests ends (default: 600)"
+    )
+    parser.add_argument(
+        "--exit-with-parent",
+        type=int,
+        nargs="?",
+        const=os.getppid(),
+        metavar="PID",
+        help="end when this parent process (default: the one that started it) is gone",
+    )
+    parser.set_defaults(run=serve)
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Where zenoh connects to and listens; nothing else is opened."""
+
+    connect: tuple[str, ...]
+    listen: tuple[str, ...]
+    multicast: bool
+
+    def configuration(self) -> str:
+        """zenoh's configuration in JSON."""
+        link = {"rx": {"max_message_size": limits.MESSAGE_BYTES_MAX + 65_536}}
+        wait = {"wait_before_close": _CONGESTION_MICROSECONDS}
+        # Left out, this is a free port on every interface: what others find by multicast.
+        by_multicast = self.multicast and not self.listen
+        listen = {} if by_multicast else {"listen": {"endpoints": self.listen}}
+        return json.dumps(
+            {
+                "mode": "peer",
+                "connect": {"endpoints": self.connect},
+                **listen,
+                "scouting": {
+                    "multicast": {"enabled": self.multicast},
+                    "gossip": {"enabled": self.multicast},
+                },
+                "transport": {
+                    "link": {**link, "tx": {"queue": {"congestion_control": {"block": wait}}}},
+                    "shared_memory": {"enabled": False},
+                },
+            }
+        )
+
+
+def serve(arguments: argparse.Namespace) -> int:
+    """Serves until a signal comes or the parent is gone; prints `ready {server id}` when it can."""
+    import zenoh
+
+    from rever_env import tasks
+    from rever_env.server import Server, ServerOptions
+    from rever_env.worlds import Worlds
+
+    if not (arguments.connect or arguments.listen or arguments.multicast):
+        print("error: expected --connect, --listen or --multicast, got none", file=sys.stderr)
+        return 2
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    endpoints = Endpoints(tuple(arguments.connect), tuple(arguments.listen), arguments.multicast)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    options = ServerOptions(arguments.fleet, arguments.sessions, arguments.idle_secs)
+    failures: list[BaseException] = []
+    with zenoh.open(zenoh.Config.from_json5(endpoints.configuration())) as network:
+        server = Server(network, Worlds(tasks.load(), options.sessions_max), options)
+
+        def simulate() -> None:
+            try:
+                server.run(stop, lambda name: print(f"ready {name}", flush=True))
+            except BaseException as error:
+                logging.exception("the simulation thread failed")
+                failures.append(error)
+            finally:
+                stop.set()
+
+        thread = threading.Thread(target=simulate, name="simulation", daemon=True)
+        thread.start()
+        _wait(stop, arguments.exit_with_parent)
+        thread.join(_FINISH_SECS_MAX)
+        if thread.is_alive():
+            # It holds the rendering contexts: no orderly end is left.
+            logging.error("the simulation did not end within %.0f s", _FINISH_SECS_MAX)
+            os._exit(1)
+    return 1 if failures else 0
+
+
+def _wait(stop: threading.Event, parent: int | None) -> None:
+    while not stop.wait(_PARENT_POLL_SECS):
+        if parent is not None and os.getppid() != parent:
+            logging.info("the parent process %d is gone", parent)
+            stop.set()

@@ -1,0 +1,164 @@
+"""One leased session: its numbered requests, its world, its saved states."""
+
+import logging
+
+import numpy as np
+
+from rever_env import protocol, world
+from rever_env.world import World
+from rever_env.worlds import Key, UnknownTask, Worlds
+
+_log = logging.getLogger(__name__)
+
+
+class _Wrong(Exception):
+    """The request is wrong at this moment; the world is unchanged."""
+
+
+class Session:
+    """Answers requests exactly once each. Use it in the thread that renders."""
+
+    def __init__(self, opened: protocol.Open, worlds: Worlds) -> None:
+        self.steps = 0
+        self.closed = False
+        self._opened = opened
+        self._worlds = worlds
+        self._last_sequence = 0
+        self._last_reply = b""
+        self._running = False
+        self._slots: dict[int, bytes] = {}
+        worlds.task(opened.task, opened.variant)
+        self._key: Key | None = self._key_of(opened.task, opened.variant)
+        self._world: World | None = worlds.take(self._key)
+
+    def answer(self, data: bytes) -> bytes | None:
+        """The reply's bytes; None when the request is older than the last one."""
+        refusal = None
+        try:
+            request = protocol.REQUEST.decode(data)
+        except protocol.CodecError as error:
+            invalid = getattr(error, "message", None)
+            if invalid is None or invalid.sequence < 1:
+                return refused(0, str(error))
+            request, refusal = invalid, str(error)
+        sequence = request.sequence
+        if sequence < self._last_sequence:
+            return None
+        if sequence == self._last_sequence:
+            return self._last_reply
+        expected = self._last_sequence + 1
+        if sequence != expected:
+            return refused(sequence, f"sequence: expected {expected}, got {sequence}")
+        if refusal is not None:
+            reply = refused(sequence, refusal)
+        else:
+            reply = self._perform(request)
+        self._last_sequence, self._last_reply = sequence, reply
+        return reply
+
+    def end(self) -> None:
+        """Gives the world back."""
+        self.closed = True
+        self._running = False
+        self._slots.clear()
+        self._release()
+
+    def _perform(self, request: protocol.Request) -> bytes:
+        sequence = request.sequence
+        try:
+            return protocol.REPLY.encode(self._reply(request))
+        except (_Wrong, UnknownTask, world.InvalidAction, world.InvalidPlacement) as error:
+            return refused(sequence, str(error))
+        except world.PhysicsDiverged as error:
+            return self._fault(sequence, protocol.FaultKind.PHYSICS_DIVERGED, str(error))
+        except world.RendererUnavailable as error:
+            return self._fault(sequence, protocol.FaultKind.RENDERER_UNAVAILABLE, str(error))
+        except Exception as error:
+            # A defect must reach the agent as a fault: silence or a default would become a label.
+            _log.exception("request %d of a session failed", sequence)
+            return self._fault(
+                sequence, protocol.FaultKind.INTERNAL, f"{type(error).__name__}: {error}"
+            )
+
+    def _reply(self, request: protocol.Request) -> protocol.Reply:
+        if self.closed:
+            raise _Wrong(f"expected nothing after Close, got {type(request).__name__}")
+        if isinstance(request, protocol.Reset):
+            return protocol.Observed(request.sequence, self._observation(self._reset(request)))
+        if isinstance(request, protocol.Close):
+            self.end()
+            return protocol.Closed(request.sequence)
+        if not self._running or self._world is None:
+            raise _Wrong(f"expected Reset first, got {type(request).__name__}: no episode runs")
+        if isinstance(request, protocol.Step):
+            transition = self._world.step(np.array(request.action, dtype=np.float64))
+            self.steps += 1
+            return protocol.Stepped(request.sequence, self._transition(transition))
+        if isinstance(request, protocol.Save):
+            self._slots[request.slot] = self._world.save()
+            return protocol.Saved(request.sequence)
+        snapshot = self._slots.get(request.slot)
+        if snapshot is None:
+            raise _Wrong(f"slot: expected one of {sorted(self._slots)}, got {request.slot}")
+        return protocol.Restored(request.sequence, self._observation(self._world.restore(snapshot)))
+
+    def _reset(self, request: protocol.Reset) -> world.Observation:
+        self._worlds.task(request.task, request.variant)
+        key = self._key_of(request.task, request.variant)
+        if self._world is None or key != self._key:
+            self._release()
+            self._world, self._key = self._worlds.take(key), key
+        observation = self._world.reset(configuration=request.configuration, seed=request.seed)
+        self._slots.clear()
+        self._running = True
+        return observation
+
+    def _fault(self, sequence: int, kind: protocol.FaultKind, reason: str) -> bytes:
+        """The world may be broken for good: the next Reset gets another one."""
+        self._running = False
+        self._slots.clear()
+        if self._world is not None:
+            self._world.close()
+        self._world = self._key = None
+        return protocol.REPLY.encode(protocol.Faulted(sequence, kind, _short(reason)))
+
+    def _release(self) -> None:
+        if self._world is not None and self._key is not None:
+            self._worlds.give_back(self._key, self._world)
+        self._world = self._key = None
+
+    def _key_of(self, task: str, variant: str) -> Key:
+        return task, variant, self._opened.image_height, self._opened.image_width
+
+    def _transition(self, transition: world.Transition) -> protocol.Transition:
+        return protocol.Transition(
+            observation=self._observation(transition.observation),
+            statistics=transition.statistics,
+            reward=transition.reward,
+            terminated=transition.terminated,
+            truncated=transition.truncated,
+        )
+
+    def _observation(self, observation: world.Observation) -> protocol.Observation:
+        image = observation.image
+        expert_action = None
+        if self._opened.expert and self._world is not None:
+            action = self._world.expert_action().astype(np.float32)
+            expert_action = tuple(action.tolist())
+        return protocol.Observation(
+            image=protocol.Image(image.shape[0], image.shape[1], image.tobytes()),
+            state=tuple(observation.state.tolist()),
+            instruction=observation.instruction,
+            expert_action=expert_action,
+        )
+
+
+def refused(sequence: int, reason: str) -> bytes:
+    """The bytes of a refusal."""
+    return protocol.REPLY.encode(protocol.Refused(sequence, _short(reason)))
+
+
+def _short(reason: str) -> str:
+    """Within the limit on texts, whatever the exception said."""
+    limit = protocol.limits.TEXT_BYTES_MAX
+    return reason.encode()[:limit].decode(errors="ignore")

@@ -1,0 +1,100 @@
+"""Snapshots: the whole state of an episode as bytes, bit-exact."""
+
+import hashlib
+import struct
+
+import mujoco
+import numpy as np
+
+from rever_env.controller import Controller
+from rever_env.fault import Fault
+from rever_env.success import Memory
+from rever_env.tasks import Task
+
+_MAGIC = b"rever-snapshot-1"
+_HEADER = struct.Struct("<16s16sIIIBBB")  # magic, task digest, steps, grasped steps, floats, flags
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class InvalidSnapshot(Fault):
+    """The bytes are no snapshot of this task."""
+
+
+def pack(
+    task: Task,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    controller: Controller,
+    progress: tuple[Memory, int],
+) -> bytes:
+    """Integration state (with warm start), commanded pose, statistics and step count."""
+    memory, steps = progress
+    state = np.zeros(mujoco.mj_stateSize(model, _STATE))
+    mujoco.mj_getState(model, data, state, _STATE)
+    floats = np.concatenate(
+        [
+            state,
+            controller.position,
+            controller.quaternion,
+            memory.source_origin,
+            memory.target_origin,
+            memory.source_half,
+            memory.target_half,
+        ]
+    ).astype("<f8")
+    header = _HEADER.pack(
+        _MAGIC,
+        _digest(task),
+        steps,
+        memory.grasped_steps,
+        len(floats),
+        memory.ever_grasped,
+        memory.consecutive_grasp,
+        memory.ever_success,
+    )
+    return header + floats.tobytes()
+
+
+def unpack(
+    content: bytes,
+    task: Task,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    controller: Controller,
+) -> tuple[Memory, int]:
+    """Puts the state into data and controller; returns statistics' memory and step count."""
+    size = mujoco.mj_stateSize(model, _STATE)
+    expected = _HEADER.size + 8 * (size + 17)
+    if len(content) != expected:
+        raise InvalidSnapshot(f"snapshot: expected {expected} bytes, got {len(content)}")
+    magic, digest, steps, grasped_steps, count, ever, consecutive, success = _HEADER.unpack_from(
+        content
+    )
+    if magic != _MAGIC or digest != _digest(task) or count != size + 17:
+        raise InvalidSnapshot(f"snapshot: expected one of task {task.name}, got another")
+    floats = np.frombuffer(content, dtype="<f8", offset=_HEADER.size).astype(np.float64)
+    if not np.isfinite(floats).all():
+        raise InvalidSnapshot("snapshot: expected finite numbers, got NaN or infinity")
+    state, rest = floats[:size], floats[size:]
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_setState(model, data, state, _STATE)
+    warm_start = data.qacc_warmstart.copy()
+    mujoco.mj_forward(model, data)
+    data.qacc_warmstart[:] = warm_start
+    controller.position, controller.quaternion = rest[:3].copy(), rest[3:7].copy()
+    memory = Memory(
+        source_origin=rest[7:9].copy(),
+        target_origin=rest[9:11].copy(),
+        source_half=rest[11:14].copy(),
+        target_half=rest[14:17].copy(),
+        grasped_steps=grasped_steps,
+        ever_grasped=bool(ever),
+        consecutive_grasp=bool(consecutive),
+        ever_success=bool(success),
+    )
+    return memory, steps
+
+
+def _digest(task: Task) -> bytes:
+    identity = f"{task.name}/{task.variant}/{task.version}"
+    return hashlib.sha256(identity.encode()).digest()[:16]

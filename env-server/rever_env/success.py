@@ -1,0 +1,154 @@
+"""Success and the other episode statistics, after SIMPLER's evaluate()."""
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rever_env.protocol import Statistics
+from rever_env.tasks import Task
+
+Vector = NDArray[np.float64]
+
+
+@dataclass
+class Memory:
+    """What the statistics remember of the episode so far."""
+
+    source_origin: Vector  # settled xy of the source's origin, metres
+    target_origin: Vector
+    source_half: Vector  # settled half extents, rotated as SIMPLER does, metres
+    target_half: Vector
+    grasped_steps: int = 0
+    ever_grasped: bool = False
+    consecutive_grasp: bool = False
+    ever_success: bool = False
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Contacts of the source now: force of each finger on it (N), and what else it touches."""
+
+    fingers: tuple[Vector, Vector]
+    robot: bool
+    target: bool
+    elsewhere: bool
+
+
+class Judge:
+    """Reads contacts and poses and says what the episode has come to."""
+
+    def __init__(self, model: mujoco.MjModel, task: Task) -> None:
+        self._model = model
+        self._task = task
+        self._source = model.body(task.source).id
+        self._target = model.body(task.target).id
+        self._fingers = [model.body(name).id for name in task.settings.finger_bodies]
+        robot_root = model.body(task.settings.robot_body).id
+        self._is_robot = [_descends(model, body, robot_root) for body in range(model.nbody)]
+
+    def begin(self, data: mujoco.MjData) -> Memory:
+        """The memory of an episode whose objects have just settled."""
+        return Memory(
+            source_origin=data.xpos[self._source][:2].copy(),
+            target_origin=data.xpos[self._target][:2].copy(),
+            source_half=_half_extents(data.xquat[self._source], self._task.source_extents),
+            target_half=_half_extents(data.xquat[self._target], self._task.target_extents),
+        )
+
+    def judge(self, data: mujoco.MjData, memory: Memory) -> Statistics:
+        """Statistics of this step; advances the memory."""
+        rule = self._task.grasp
+        touch = self.touch(data)
+        grasped = self.grasped(data, touch)
+        memory.grasped_steps = memory.grasped_steps + 1 if grasped else 0
+        memory.ever_grasped |= grasped
+        memory.consecutive_grasp |= memory.grasped_steps >= rule.consecutive_steps
+        # SIMPLER compares the settled origin with the current centre of mass here; the
+        # offset between the two leaks into the source's displacement and is kept.
+        source_moved = _norm(data.xipos[self._source][:2] - memory.source_origin)
+        target_moved = _norm(data.xpos[self._target][:2] - memory.target_origin)
+        on_target = self.on_target(data, memory, touch)
+        memory.ever_success |= on_target
+        return Statistics(
+            is_success=on_target,
+            is_grasped=grasped,
+            ever_grasped=memory.ever_grasped,
+            consecutive_grasp=memory.consecutive_grasp,
+            moved_correct_object=source_moved > rule.moved_min and source_moved > target_moved,
+            moved_wrong_object=target_moved > rule.moved_min and target_moved > source_moved,
+            source_on_target=on_target,
+            ever_success=memory.ever_success,
+            released_success=on_target and not touch.robot and (touch.target or touch.elsewhere),
+        )
+
+    def touch(self, data: mujoco.MjData) -> Touch:
+        """Contacts of the source whose impulse per physics step is large enough to count."""
+        fingers = (np.zeros(3), np.zeros(3))
+        robot = target = elsewhere = False
+        wrench = np.zeros(6)
+        force = np.zeros(3)
+        for index in range(data.ncon):
+            contact = data.contact[index]
+            bodies = self._model.geom_bodyid[contact.geom1], self._model.geom_bodyid[contact.geom2]
+            if self._source not in bodies or bodies[0] == bodies[1]:
+                continue
+            mujoco.mj_contactForce(self._model, data, index, wrench)
+            if _norm(wrench[:3]) * self._task.settings.timestep < self._task.grasp.impulse_min:
+                continue
+            other = bodies[1] if bodies[0] == self._source else bodies[0]
+            if other in self._fingers:
+                mujoco.mju_mulMatTVec(force, contact.frame.reshape(3, 3), wrench[:3])
+                # The contact force acts on the second geom's body; flip it when that is the finger.
+                sign = 1.0 if bodies[1] == self._source else -1.0
+                fingers[self._fingers.index(other)][:] += sign * force
+            robot |= self._is_robot[other]
+            target |= bool(other == self._target)
+            elsewhere |= bool(other != self._target and not self._is_robot[other])
+        return Touch(fingers, robot, target, elsewhere)
+
+    def grasped(self, data: mujoco.MjData, touch: Touch) -> bool:
+        """Both fingers press the source within 60 degrees of their closing direction."""
+        rule = self._task.grasp
+        cosine_min = math.cos(math.radians(rule.angle_max))
+        for body, force, closing in zip(self._fingers, touch.fingers, (-1.0, 1.0), strict=True):
+            magnitude = _norm(force)
+            if magnitude * self._task.settings.timestep < rule.impulse_min:
+                return False
+            axis = data.xmat[body].reshape(3, 3)[:, 1]
+            along = closing * (axis[0] * force[0] + axis[1] * force[1] + axis[2] * force[2])
+            if along < cosine_min * magnitude:
+                return False
+        return True
+
+    def on_target(self, data: mujoco.MjData, memory: Memory, touch: Touch) -> bool:
+        offset = data.xipos[self._source] - data.xipos[self._target]
+        half = memory.target_half
+        near = _norm(offset[:2]) <= _norm(half[:2]) + self._task.grasp.target_margin
+        gap = offset[2] - half[2] - memory.source_half[2]
+        above = offset[2] > 0.0 and gap <= self._task.height_offset_max
+        if self._task.completely_on_target and touch.elsewhere:
+            return False
+        return bool(near and above)
+
+
+def _half_extents(quaternion: Vector, extents: tuple[float, float, float]) -> Vector:
+    """SIMPLER rotates the full extents as a vector (signs and all) and halves them; kept as is."""
+    rotated = np.zeros(3)
+    mujoco.mju_rotVecQuat(rotated, np.array(extents), quaternion)
+    return 0.5 * rotated
+
+
+def _descends(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
+    while body != 0:
+        if body == ancestor:
+            return True
+        body = int(model.body_parentid[body])
+    return False
+
+
+def _norm(vector: Vector) -> float:
+    """Euclidean norm summed in order, so that it is the same in every language."""
+    return math.sqrt(sum(float(value) * float(value) for value in vector))

@@ -1,0 +1,277 @@
+"""The world of one task: reset, step, save, restore, render."""
+
+from dataclasses import dataclass
+from types import TracebackType
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rever_env import expert, snapshot
+from rever_env.camera import Camera
+from rever_env.controller import Controller
+from rever_env.fault import (
+    Fault,
+    InvalidAction,
+    InvalidPlacement,
+    PhysicsDiverged,
+    RendererUnavailable,
+)
+from rever_env.placement import place
+from rever_env.protocol import Statistics
+from rever_env.success import Judge, Memory
+from rever_env.tasks import Placement, Task
+
+__all__ = [
+    "Fault",
+    "InvalidAction",
+    "InvalidPlacement",
+    "Observation",
+    "PhysicsDiverged",
+    "RendererUnavailable",
+    "Statistics",
+    "Transition",
+    "World",
+]
+
+_START_GAP = 0.002  # objects start this far above rest, metres
+_SPEED_MAX = 100.0  # m/s or rad/s: beyond this the physics is broken, not fast
+# Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
+_DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a policy may see. image: uint8 (height, width, 3).
+
+    state: float32 (8,) in Bridge's order: x y z (m) roll pitch yaw (rad, base frame), pad 0,
+    gripper opening 0 to 1.
+    """
+
+    image: NDArray[np.uint8]
+    state: NDArray[np.float32]
+    instruction: str
+
+
+@dataclass(frozen=True)
+class Transition:
+    """The result of one control step. Success ends no episode: SIMPLER reads the last step."""
+
+    observation: Observation
+    statistics: Statistics
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+class World:
+    """One task in MuJoCo with its camera. Not thread-safe: use it in the thread that made it."""
+
+    def __init__(self, task: Task, image_height: int = 128, image_width: int = 128) -> None:
+        # The warning counters are read after each step; MuJoCo's own handler would also append to
+        # a log file in whatever folder the process runs in.
+        mujoco.set_mju_user_warning(_ignore)
+        self.task = task
+        self.model = mujoco.MjModel.from_xml_path(str(task.scene))
+        assert self.model.opt.timestep == task.settings.timestep, "scene and tasks.toml disagree"
+        self.data = mujoco.MjData(self.model)
+        self.controller = Controller(self.model, task)
+        self.judge = Judge(self.model, task)
+        self.memory: Memory | None = None
+        self.steps = 0
+        self.camera = Camera(self.model, task.settings.camera, image_height, image_width)
+        self._arm = [self.model.actuator(name).id for name in task.settings.arm_joints]
+        self._fingers = [self.model.actuator(name).id for name in task.settings.finger_joints]
+        self._finger_positions = [
+            self.model.joint(name).qposadr[0] for name in task.settings.finger_joints
+        ]
+        self._finger_range = self.model.joint(task.settings.finger_joints[0]).range.copy()
+
+    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+        """Places and settles the objects; the same arguments give the same bytes."""
+        placement = place(self.task, configuration, seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.memory = None
+        joints = np.array(self.task.robot_joints)
+        self.data.qpos[: len(joints)] = joints
+        self.data.ctrl[:] = joints
+        self._place_objects(placement)
+        self._settle()
+        self.steps = 0
+        self.controller.reset(self.data)
+        self.memory = self.judge.begin(self.data)
+        return self._observe()
+
+    def step(self, action: NDArray[np.float64]) -> Transition:
+        """One control step of 0.2 s. action: float64 (7,), see the controller; gripper +1 open."""
+        memory = self._running()
+        if self.steps >= self.task.steps_max:
+            raise InvalidAction(f"step {self.steps + 1}: expected at most {self.task.steps_max}")
+        action = _checked(action)
+        target = self.controller.joint_target(self.data, action)
+        self._advance(target, float(action[6]))
+        self.steps += 1
+        statistics = self.judge.judge(self.data, memory)
+        return Transition(
+            observation=self._observe(),
+            statistics=statistics,
+            reward=1.0 if statistics.is_success else 0.0,
+            terminated=False,
+            truncated=self.steps >= self.task.steps_max,
+        )
+
+    def save(self) -> bytes:
+        """The whole state of the episode, bit-exact."""
+        return snapshot.pack(self.task, self.model, self.data, self.controller, self._memory_now())
+
+    def restore(self, content: bytes) -> Observation:
+        """Returns to a saved state of the same task."""
+        self.memory, self.steps = snapshot.unpack(
+            content, self.task, self.model, self.data, self.controller
+        )
+        return self._observe()
+
+    def expert_action(self) -> NDArray[np.float64]:
+        """The scripted expert's noise-free action here, float64 (7,); changes nothing."""
+        return self.expert_decision().action
+
+    def expert_decision(self) -> expert.Decision:
+        """The expert's action with the reason for it."""
+        return expert.decide(self.task, expert.look(self))
+
+    def close(self) -> None:
+        self.camera.close()
+
+    def __enter__(self) -> "World":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def running_memory(self) -> Memory:
+        """The statistics' memory; an error before the first reset."""
+        return self._running()
+
+    def gripper_opening(self) -> float:
+        """Mean finger opening, 0 (closed) to 1 (open) of the joints' range."""
+        low, high = (float(limit) for limit in self._finger_range)
+        mean = sum(float(self.data.qpos[index]) for index in self._finger_positions) / 2.0
+        return min(max((mean - low) / (high - low), 0.0), 1.0)
+
+    def _memory_now(self) -> tuple[Memory, int]:
+        return self._running(), self.steps
+
+    def _running(self) -> Memory:
+        if self.memory is None:
+            raise InvalidAction("step, save or expert before reset: expected a reset world")
+        return self.memory
+
+    def _place_objects(self, placement: Placement) -> None:
+        task = self.task
+        rows = [(task.source, placement.source_x, placement.source_y, task.source_height)]
+        yaws = [placement.source_yaw]
+        if task.target_height is not None:
+            rows.append((task.target, placement.target_x, placement.target_y, task.target_height))
+            yaws.append(0.0)
+        for (name, x, y, height), yaw in zip(rows, yaws, strict=True):
+            start = self.model.joint(name).qposadr[0]
+            self.data.qpos[start : start + 3] = (x, y, height + _START_GAP)
+            quaternion = np.zeros(4)
+            mujoco.mju_axisAngle2Quat(quaternion, np.array([0.0, 0.0, 1.0]), np.deg2rad(yaw))
+            self.data.qpos[start + 3 : start + 7] = quaternion
+
+    def _settle(self) -> None:
+        """Lets the objects come to rest, as SIMPLER does after its drop (which is left out)."""
+        settings = self.task.settings
+        steps = round(settings.settle / settings.timestep)
+        mujoco.mj_step(self.model, self.data, steps)
+        self.data.qvel[:] = 0.0
+        mujoco.mj_step(self.model, self.data, steps)
+        moving = self.data.qvel[len(self.task.robot_joints) :].reshape(-1, 6)  # (objects, 6)
+        speed = float(np.abs(moving[:, :3]).sum())
+        spin = float(np.abs(moving[:, 3:]).sum())
+        if speed > settings.settle_speed_max or spin > settings.settle_spin_max:
+            mujoco.mj_step(self.model, self.data, round(settings.settle_extra / settings.timestep))
+        self._refresh()
+
+    def _advance(self, target: NDArray[np.float64], gripper: float) -> None:
+        """Runs the physics of one control step; the arm's target moves linearly during the ramp."""
+        settings = self.task.settings
+        share = 0.5 * (min(max(gripper, -1.0), 1.0) + 1.0)
+        opening = settings.gripper_closed + share * (
+            settings.gripper_open - settings.gripper_closed
+        )
+        self.data.ctrl[self._fingers] = opening
+        start = self.data.ctrl[self._arm].copy()
+        ramp_steps = round(settings.ramp / settings.timestep)
+        for index in range(1, ramp_steps + 1):
+            self.data.ctrl[self._arm] = start + (target - start) * (index / ramp_steps)
+            mujoco.mj_step(self.model, self.data)
+        self.data.ctrl[self._arm] = target
+        mujoco.mj_step(self.model, self.data, settings.substeps - ramp_steps)
+        self._refresh()
+
+    def _refresh(self) -> None:
+        """Brings poses and contacts up to date: mj_step leaves them one physics step old.
+
+        The warm start is put back, so that going on from here equals going on from a restore.
+        """
+        warm_start = self.data.qacc_warmstart.copy()
+        mujoco.mj_forward(self.model, self.data)
+        self.data.qacc_warmstart[:] = warm_start
+        diverged = [
+            warning.name
+            for warning in (
+                mujoco.mjtWarning.mjWARN_BADQPOS,
+                mujoco.mjtWarning.mjWARN_BADQVEL,
+                mujoco.mjtWarning.mjWARN_BADQACC,
+            )
+            if self.data.warning[warning].number > 0
+        ]
+        speed = float(np.abs(self.data.qvel).max())
+        if diverged or not np.isfinite(self.data.qpos).all() or not speed <= _SPEED_MAX:
+            self.memory = None
+            raise PhysicsDiverged(
+                f"physics of {self.task.name} at step {self.steps}: expected finite speeds up to "
+                f"{_SPEED_MAX}, got {speed} with warnings {diverged}"
+            )
+
+    def _observe(self) -> Observation:
+        return Observation(
+            image=self.camera.image(self.data),
+            state=self._state(),
+            instruction=self.task.instruction,
+        )
+
+    def _state(self) -> NDArray[np.float32]:
+        data = self.data
+        base = self.model.body(self.task.settings.robot_body).id
+        site = self.model.site(self.task.settings.tcp).id
+        world_from_base = data.xmat[base].reshape(3, 3)
+        position = world_from_base.T @ (data.site_xpos[site] - data.xpos[base])
+        attitude = world_from_base.T @ data.site_xmat[site].reshape(3, 3) @ _DOWN.T
+        roll = np.arctan2(attitude[2, 1], attitude[2, 2])
+        pitch = np.arctan2(-attitude[2, 0], np.hypot(attitude[2, 1], attitude[2, 2]))
+        yaw = np.arctan2(attitude[1, 0], attitude[0, 0])
+        return np.array([*position, roll, pitch, yaw, 0.0, self.gripper_opening()], np.float32)
+
+
+def _ignore(_warning: object) -> None:
+    pass
+
+
+def _checked(action: NDArray[np.float64]) -> NDArray[np.float64]:
+    array = np.asarray(action)
+    if array.shape != (7,):
+        raise InvalidAction(f"action: expected shape (7,), got {array.shape}")
+    if array.dtype.kind not in "fiu":
+        raise InvalidAction(f"action: expected numbers, got dtype {array.dtype}")
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        raise InvalidAction(f"action: expected finite numbers, got {array.tolist()}")
+    return array

@@ -1,0 +1,52 @@
+"""A server that works is healthy, one that is stopped or absent is not."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[subprocess.Popen[str], str]]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    command = [sys.executable, "-m", "rever_env", "serve", "--exit-with-parent"]
+    server = subprocess.Popen(
+        [*command, "--listen", endpoint],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    yield server, endpoint
+    server.kill()
+    server.communicate()
+
+
+def health(endpoint: str, timeout_secs: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rever_env", "health", "--connect", endpoint]
+    return subprocess.run(
+        [*command, "--timeout-secs", timeout_secs],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_only_a_server_that_works_is_healthy(served: tuple[subprocess.Popen[str], str]) -> None:
+    server, endpoint = served
+    assert server.stdout is not None
+    name = server.stdout.readline().removeprefix("ready ").strip()
+    working = health(endpoint, "60")
+    assert (working.returncode, working.stderr) == (0, "")
+    assert working.stdout == f"{name}: 0 of 16 sessions in use\n"
+
+    server.send_signal(signal.SIGSTOP)
+    stopped = health(endpoint, "0.5")
+    assert (stopped.returncode, stopped.stdout) == (1, "")
+    assert f"no server of fleet local answered at {endpoint}" in stopped.stderr

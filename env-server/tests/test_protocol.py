@@ -1,0 +1,199 @@
+"""The protocol against the golden bytes that the Rust crate wrote."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rever_env import protocol
+from rever_env.protocol import Keys
+
+GOLDEN = Path(__file__).resolve().parents[2] / "protocol" / "golden"
+REFUSED: dict[str, dict[str, str]] = json.loads((GOLDEN / "refused" / "index.json").read_text())
+CODECS: dict[str, protocol.Codec[Any]] = {
+    "description": protocol.DESCRIPTION,
+    "heartbeat": protocol.HEARTBEAT,
+    "open": protocol.OPEN,
+    "opening": protocol.OPENING,
+    "outcome": protocol.OUTCOME,
+    "reply": protocol.REPLY,
+    "request": protocol.REQUEST,
+    "verifier_update": protocol.VERIFIER_UPDATE,
+}
+SPOON = "widowx_spoon_on_towel"
+OBSERVATION = protocol.Observation(
+    image=protocol.Image(2, 3, bytes(index * 14 for index in range(18))),
+    state=(0.25, -0.125, 0.5, 0.0, -1.5, 3.0, 0.0, 1.0),
+    instruction="put the spoon on the towel",
+    expert_action=None,
+)
+ACTION = (0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0)
+STATISTICS = protocol.Statistics(False, False, True, False, True, False, False, False, False)
+TRANSITION = protocol.Transition(
+    dataclasses.replace(OBSERVATION, expert_action=ACTION), STATISTICS, 0.0, False, True
+)
+EXAMPLES: dict[str, Any] = {
+    "description": protocol.Description(
+        protocol=protocol.PROTOCOL_VERSION,
+        server="0123456789abcdef",
+        simulator="rever_env",
+        simulator_version="0.0.0 mujoco 3.8.0",
+        tasks=(
+            protocol.TaskDescription(SPOON, "default", 1, "put the spoon on the towel", 60, 24),
+            protocol.TaskDescription(
+                "widowx_put_eggplant_in_basket",
+                "default",
+                1,
+                "put eggplant into yellow basket",
+                120,
+                24,
+            ),
+        ),
+        state=("x", "y", "z", "roll", "pitch", "yaw", "pad", "gripper"),
+        action=("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "gripper"),
+        image_side_max=1024,
+        sessions=3,
+        sessions_max=16,
+        slots_max=16,
+        idle_secs_max=600,
+    ),
+    "heartbeat": protocol.Heartbeat("0123456789abcdef", 3, 70_000, 5_000_000_000),
+    "open": protocol.Open(1, SPOON, "default", 128, 128, True, "agent"),
+    "opening_opened": protocol.Opened("fedcba9876543210"),
+    "opening_refused": protocol.OpenRefused("all 16 sessions are in use"),
+    "request_reset": protocol.Reset(1, SPOON, "default", 23, 7),
+    "request_reset_random": protocol.Reset(300, SPOON, "default", None, (1 << 53) - 1),
+    "request_step": protocol.Step(2, ACTION),
+    "request_save": protocol.Save(3, 0),
+    "request_restore": protocol.Restore(70_000, 15),
+    "request_close": protocol.Close(5_000_000_000),
+    "reply_observed": protocol.Observed(1, OBSERVATION),
+    "reply_stepped": protocol.Stepped(2, TRANSITION),
+    "reply_saved": protocol.Saved(3),
+    "reply_restored": protocol.Restored(4, OBSERVATION),
+    "reply_closed": protocol.Closed(5),
+    "reply_refused": protocol.Refused(6, "slot 3 holds no state"),
+    "reply_faulted": protocol.Faulted(
+        7, protocol.FaultKind.PHYSICS_DIVERGED, "expected finite speeds up to 100, got 250"
+    ),
+    "outcome": protocol.EpisodeOutcome(
+        run="evaluation-7",
+        task=SPOON,
+        variant="default",
+        configuration=None,
+        seed=3_000_000_000,
+        episode=12,
+        strategy="verifier",
+        candidates=5,
+        temperature=0.75,
+        policy="00ff" * 16,
+        verifier="ff00" * 16,
+        statistics=STATISTICS,
+        steps=60,
+        score_mean=0.625,
+        simulator="rever_env 0.0.0 mujoco 3.8.0",
+    ),
+    "verifier_update": protocol.VerifierUpdate(
+        "default", "0a" * 32, "00ff" * 16, bytes(range(256))
+    ),
+}
+
+
+def codec_of(name: str) -> protocol.Codec[Any]:
+    """The codec for an example's name, which begins with its message's."""
+    return CODECS[name] if name in CODECS else CODECS[name.split("_")[0]]
+
+
+def test_there_is_an_example_for_each_golden_file() -> None:
+    assert {file.stem for file in GOLDEN.glob("*.msgpack")} == EXAMPLES.keys()
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_golden_bytes_are_written_and_read(name: str) -> None:
+    golden = (GOLDEN / f"{name}.msgpack").read_bytes()
+    codec = codec_of(name)
+    assert codec.encode(EXAMPLES[name]) == golden
+    assert codec.decode(golden) == EXAMPLES[name]
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_part_of_a_message_and_more_than_it_are_refused(name: str) -> None:
+    golden = (GOLDEN / f"{name}.msgpack").read_bytes()
+    codec = codec_of(name)
+    for length in range(len(golden)):
+        with pytest.raises(protocol.Malformed):
+            codec.decode(golden[:length])
+    with pytest.raises(protocol.CodecError):
+        codec.decode(golden + b"\xc0")
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_malformed_bytes_are_refused_in_the_same_words(name: str) -> None:
+    data = (GOLDEN / "refused" / f"{name}.msgpack").read_bytes()
+    with pytest.raises(protocol.CodecError) as refusal:
+        CODECS[REFUSED[name]["message"]].decode(data)
+    assert REFUSED[name]["words"] in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", [name for name in EXAMPLES if name.startswith("request")])
+def test_flipped_bytes_are_refused_or_read_as_a_valid_message(name: str) -> None:
+    golden = (GOLDEN / f"{name}.msgpack").read_bytes()
+    for position in range(len(golden)):
+        for byte in range(0, 256, 5):
+            data = bytearray(golden)
+            data[position] = byte
+            try:
+                message = protocol.REQUEST.decode(bytes(data))
+            except protocol.CodecError:
+                continue
+            assert len(protocol.REQUEST.encode(message)) == len(golden)
+
+
+def test_a_field_in_another_order_is_read() -> None:
+    data = b"\x81\xa4Save\x82\xa4slot\x00\xa8sequence\x03"
+    assert protocol.REQUEST.decode(data) == protocol.Save(3, 0)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "letters"), [(15, 31), (16, 32), (255, 255), (256, 256), (300, 600)]
+)
+def test_lists_and_texts_of_every_header_are_read(tasks: int, letters: int) -> None:
+    description = EXAMPLES["description"]
+    task = dataclasses.replace(description.tasks[0], instruction="a" * letters)
+    long = dataclasses.replace(description, tasks=(task,) * tasks)
+    assert protocol.DESCRIPTION.decode(protocol.DESCRIPTION.encode(long)) == long
+
+
+def test_an_invalid_message_is_not_written() -> None:
+    with pytest.raises(protocol.Invalid, match="expected finite numbers, got nan at index 0"):
+        protocol.REQUEST.encode(protocol.Step(1, (float("nan"),) * 7))
+    with pytest.raises(protocol.Invalid, match="holder: expected 1 to 128 bytes, got 129"):
+        protocol.OPEN.encode(dataclasses.replace(EXAMPLES["open"], holder="a" * 129))
+
+
+def test_an_invalid_request_tells_its_number() -> None:
+    data = (GOLDEN / "refused" / "nan.msgpack").read_bytes()
+    with pytest.raises(protocol.Invalid) as refusal:
+        protocol.REQUEST.decode(data)
+    assert refusal.value.message.sequence == 2
+
+
+def test_keys_lie_under_version_and_fleet() -> None:
+    keys = Keys("home")
+    assert keys.server("s1") == "rever/1/home/server/s1"
+    assert keys.describe("s1") == "rever/1/home/server/s1/describe"
+    assert keys.open("s1") == "rever/1/home/server/s1/open"
+    assert keys.heartbeat("s1") == "rever/1/home/server/s1/heartbeat"
+    assert keys.session("a") == "rever/1/home/session/a"
+    assert keys.request("a") == "rever/1/home/session/a/request"
+    assert keys.reply("a") == "rever/1/home/session/a/reply"
+    assert keys.outcome("run.1") == "rever/1/home/outcome/run.1"
+    assert keys.verifier("best_of-2") == "rever/1/home/verifier/best_of-2"
+
+
+@pytest.mark.parametrize("name", ["", "*", "**", "a/b", "a b", "$*", "a?b", "ä", "a" * 65, "a\n"])
+def test_a_name_with_wildcards_or_slashes_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="cannot stand in a key"):
+        Keys(name)

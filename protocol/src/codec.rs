@@ -1,0 +1,102 @@
+//! Messages to bytes and back, strictly: a body is read only when every byte of it is meant.
+//!
+//! Reading goes: size limit → structure of the raw bytes → types → values → shape. The last step asks that the
+//! message, written again, has the shape that came: this refuses what serde would let pass (a struct sent as an
+//! array, an integer for a float, text for bytes, a missing optional field). The order of a map's entries is free.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::structure;
+
+/// Why a message was not written or not read.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum CodecError {
+    /// Beyond the message's size limit; nothing was decoded.
+    #[error("{message} has {bytes} bytes, limit {bytes_max}")]
+    TooLarge {
+        /// Which message.
+        message: &'static str,
+        /// Size that came.
+        bytes: usize,
+        /// Size that is allowed.
+        bytes_max: usize,
+    },
+    /// The bytes are not this message.
+    #[error("{message} cannot be read: {reason}")]
+    Malformed {
+        /// Which message.
+        message: &'static str,
+        /// What was expected and what came.
+        reason: String,
+    },
+    /// The bytes are this message, but a value in it is out of bounds.
+    #[error("{message} is invalid: {reason}")]
+    Invalid {
+        /// Which message.
+        message: &'static str,
+        /// What was expected and what came.
+        reason: String,
+    },
+}
+
+/// One of the protocol's messages.
+pub trait Message: Serialize + DeserializeOwned {
+    /// What errors call it.
+    const NAME: &'static str;
+    /// Limit on the encoded size.
+    const BYTES_MAX: usize;
+
+    /// Checks every value; the reason names the field, what was expected and what came.
+    fn validate(&self) -> Result<(), String>;
+
+    /// Looks at the raw bytes first, so that another version is refused for its version and not for its fields.
+    fn recognise(_bytes: &[u8]) -> Result<(), String> {
+        Ok(())
+    }
+}
+
+/// Writes `message`; an invalid one is refused here, so that a peer never sees it.
+pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
+    message.validate().map_err(|reason| CodecError::Invalid { message: M::NAME, reason })?;
+    let bytes = rmp_serde::to_vec_named(message)
+        .map_err(|error| CodecError::Malformed { message: M::NAME, reason: error.to_string() })?;
+    check_size::<M>(bytes.len())?;
+    Ok(bytes)
+}
+
+/// Reads a message out of exactly `bytes`.
+pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, CodecError> {
+    check_size::<M>(bytes.len())?;
+    let malformed = |reason| CodecError::Malformed { message: M::NAME, reason };
+    let shape_came = structure::check(bytes).map_err(malformed)?;
+    M::recognise(bytes).map_err(|reason| CodecError::Invalid { message: M::NAME, reason })?;
+    let message: M = rmp_serde::from_slice(bytes).map_err(|error| malformed(words(error)))?;
+    message.validate().map_err(|reason| CodecError::Invalid { message: M::NAME, reason })?;
+    let meant = shape(&message).map_err(malformed)?;
+    if shape_came != meant {
+        return Err(malformed(format!("expected the shape {meant}, got {shape_came}")));
+    }
+    Ok(message)
+}
+
+/// Refuses a message by its size alone, for those who hold bytes that they have not yet copied.
+pub fn check_size<M: Message>(bytes: usize) -> Result<(), CodecError> {
+    if bytes > M::BYTES_MAX {
+        return Err(CodecError::TooLarge { message: M::NAME, bytes, bytes_max: M::BYTES_MAX });
+    }
+    Ok(())
+}
+
+/// serde's own sentence without the wrapping of the format.
+fn words(error: rmp_serde::decode::Error) -> String {
+    match error {
+        rmp_serde::decode::Error::Syntax(reason) => reason,
+        other => other.to_string(),
+    }
+}
+
+fn shape<M: Message>(message: &M) -> Result<structure::Shape, String> {
+    let bytes = rmp_serde::to_vec_named(message).map_err(|error| error.to_string())?;
+    structure::check(&bytes)
+}

@@ -1,0 +1,42 @@
+//! Every limit of the protocol; a message beyond one of them is refused, most of them before it is decoded.
+
+/// Bytes of a [`crate::Request`]; the longest valid one is far below.
+pub const REQUEST_BYTES_MAX: usize = 1024;
+/// Bytes of a [`crate::Reply`]: the largest image and everything beside it.
+pub const REPLY_BYTES_MAX: usize = 4 << 20;
+/// Bytes of an [`crate::Open`].
+pub const OPEN_BYTES_MAX: usize = 1024;
+/// Bytes of an [`crate::Opening`].
+pub const OPENING_BYTES_MAX: usize = 4096;
+/// Bytes of a [`crate::Description`].
+pub const DESCRIPTION_BYTES_MAX: usize = 256 << 10;
+/// Bytes of a [`crate::Heartbeat`].
+pub const HEARTBEAT_BYTES_MAX: usize = 512;
+/// Bytes of an [`crate::EpisodeOutcome`].
+pub const OUTCOME_BYTES_MAX: usize = 4096;
+/// Bytes of a [`crate::VerifierUpdate`]: two hidden layers on a 4096-wide state in 32 bits fit.
+pub const VERIFIER_UPDATE_BYTES_MAX: usize = 64 << 20;
+
+/// The largest of the above: what a transport must be willing to carry.
+pub const MESSAGE_BYTES_MAX: usize = VERIFIER_UPDATE_BYTES_MAX;
+
+/// Bytes of a name: task, variant, run, strategy, holder, server, session, digest.
+pub const NAME_BYTES_MAX: usize = 128;
+/// Bytes of a text: instruction, reason, simulator.
+pub const TEXT_BYTES_MAX: usize = 1024;
+/// Height and width of an image in pixels.
+pub const IMAGE_SIDE_MAX: usize = 1024;
+/// Maps and arrays inside one another.
+pub const DEPTH_MAX: usize = 8;
+/// Elements of an array or a map.
+pub const ELEMENTS_MAX: usize = 4096;
+/// Save slots of a session, numbered from 0.
+pub const SLOTS_MAX: u32 = 16;
+/// Sessions one server process may offer.
+pub const SESSIONS_MAX: u32 = 256;
+/// First seed that is too large: seeds fit a double, so that every language can hold them.
+pub const SEED_END: u64 = 1 << 53;
+/// Values of an action: translation in metres, rotation vector in radians, gripper +1 open or -1 closed.
+pub const ACTION_LENGTH: usize = 7;
+/// Values of a state, in Bridge's order: x y z roll pitch yaw pad gripper.
+pub const STATE_LENGTH: usize = 8;

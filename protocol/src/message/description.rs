@@ -1,0 +1,96 @@
+//! What a server says about itself.
+
+use serde::{Deserialize, Serialize};
+
+use super::value;
+use crate::codec::Message;
+use crate::limits::{
+    ACTION_LENGTH, DESCRIPTION_BYTES_MAX, IMAGE_SIDE_MAX, SESSIONS_MAX, SLOTS_MAX, STATE_LENGTH,
+};
+
+/// One task in one variant.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TaskDescription {
+    /// SIMPLER's name.
+    pub task: String,
+    /// `default`, or what is changed.
+    pub variant: String,
+    /// Rises when results of the task may change.
+    pub version: u32,
+    /// What the robot is told to do.
+    pub instruction: String,
+    /// Steps after which an episode is truncated.
+    pub steps_max: u32,
+    /// Fixed configurations, numbered from 0; the random ones lie beside them.
+    pub configurations: u32,
+}
+
+/// The answer to a query on `describe`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Description {
+    /// Version of the protocol that the server speaks.
+    pub protocol: u32,
+    /// The server's id, as in its keys.
+    pub server: String,
+    /// Name of the simulator.
+    pub simulator: String,
+    /// Its version, with that of the physics engine; results are comparable within one of these.
+    pub simulator_version: String,
+    /// Every task in every variant.
+    pub tasks: Vec<TaskDescription>,
+    /// Names of the state's values.
+    pub state: Vec<String>,
+    /// Names of the action's values.
+    pub action: Vec<String>,
+    /// Largest height and width of an image.
+    pub image_side_max: u32,
+    /// Sessions in use.
+    pub sessions: u32,
+    /// Sessions that can be in use.
+    pub sessions_max: u32,
+    /// Save slots of a session.
+    pub slots_max: u32,
+    /// Seconds without a request after which a session ends.
+    pub idle_secs_max: u32,
+}
+
+impl Message for Description {
+    const NAME: &'static str = "description";
+    const BYTES_MAX: usize = DESCRIPTION_BYTES_MAX;
+
+    fn recognise(bytes: &[u8]) -> Result<(), String> {
+        value::recognise_protocol(bytes)
+    }
+
+    fn validate(&self) -> Result<(), String> {
+        value::protocol(self.protocol)?;
+        value::name("server", &self.server)?;
+        value::name("simulator", &self.simulator)?;
+        value::name("simulator_version", &self.simulator_version)?;
+        value::elements("tasks", self.tasks.len())?;
+        for task in &self.tasks {
+            value::name("task", &task.task)?;
+            value::name("variant", &task.variant)?;
+            value::text("instruction", &task.instruction)?;
+            value::range("steps_max", task.steps_max.into(), 1, 1_000_000)?;
+        }
+        value::range("state", self.state.len() as u64, STATE_LENGTH as u64, STATE_LENGTH as u64)?;
+        value::range(
+            "action",
+            self.action.len() as u64,
+            ACTION_LENGTH as u64,
+            ACTION_LENGTH as u64,
+        )?;
+        self.state
+            .iter()
+            .chain(&self.action)
+            .try_for_each(|name| value::name("value name", name))?;
+        value::range("image_side_max", self.image_side_max.into(), 1, IMAGE_SIDE_MAX as u64)?;
+        value::range("sessions_max", self.sessions_max.into(), 1, SESSIONS_MAX.into())?;
+        value::range("sessions", self.sessions.into(), 0, self.sessions_max.into())?;
+        value::range("slots_max", self.slots_max.into(), 0, SLOTS_MAX.into())?;
+        value::range("idle_secs_max", self.idle_secs_max.into(), 1, 1_000_000)
+    }
+}

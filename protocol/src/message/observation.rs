@@ -1,0 +1,61 @@
+//! What a policy sees before a decision.
+
+use serde::{Deserialize, Serialize};
+
+use super::{single, value};
+use crate::limits::{ACTION_LENGTH, IMAGE_SIDE_MAX, STATE_LENGTH};
+
+/// A picture.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Image {
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// height × width × 3 bytes: rows from the top, red green blue.
+    #[serde(with = "serde_bytes")]
+    pub pixels: Vec<u8>,
+}
+
+/// Everything that a policy may know, and on request the expert's opinion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Observation {
+    /// The camera's picture in the size that was asked for at `Open`.
+    pub image: Image,
+    /// Bridge's order: x y z in metres, roll pitch yaw in radians, 0, gripper opening 0 to 1; base frame.
+    #[serde(deserialize_with = "single::array")]
+    pub state: [f32; STATE_LENGTH],
+    /// What the robot is told to do.
+    pub instruction: String,
+    /// The scripted expert's action at this state; only in a session opened with `expert`.
+    #[serde(deserialize_with = "single::maybe_array")]
+    pub expert_action: Option<[f32; ACTION_LENGTH]>,
+}
+
+impl Image {
+    pub(crate) fn validate(&self) -> Result<(), String> {
+        value::range("image height", self.height as u64, 1, IMAGE_SIDE_MAX as u64)?;
+        value::range("image width", self.width as u64, 1, IMAGE_SIDE_MAX as u64)?;
+        let bytes = self.height * self.width * 3;
+        if self.pixels.len() != bytes {
+            return Err(format!(
+                "image: expected {bytes} bytes for {} x {} pixels, got {}",
+                self.height,
+                self.width,
+                self.pixels.len()
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl Observation {
+    pub(crate) fn validate(&self) -> Result<(), String> {
+        self.image.validate()?;
+        value::finite("state", &self.state)?;
+        value::text("instruction", &self.instruction)?;
+        self.expert_action.as_ref().map_or(Ok(()), |action| value::finite("expert_action", action))
+    }
+}

@@ -1,0 +1,63 @@
+//! What became of one episode, for whoever collects labels or watches.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Statistics, single, value};
+use crate::codec::Message;
+use crate::limits::{OUTCOME_BYTES_MAX, SEED_END};
+
+/// Published once for each episode that ran to its end; an episode that broke has none.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpisodeOutcome {
+    /// The run that the episode belongs to.
+    pub run: String,
+    /// SIMPLER's name.
+    pub task: String,
+    /// `default`, or what is changed.
+    pub variant: String,
+    /// One of the fixed configurations; none: a random placement.
+    pub configuration: Option<u32>,
+    /// Of the placement.
+    pub seed: u64,
+    /// Number of the episode within task and variant.
+    pub episode: u32,
+    /// How the candidate was chosen.
+    pub strategy: String,
+    /// Candidates per step.
+    pub candidates: u32,
+    /// Of the sampling.
+    #[serde(deserialize_with = "single::one")]
+    pub temperature: f32,
+    /// Digest of the policy's weights.
+    pub policy: String,
+    /// Digest of the verifier's weights, when one scored.
+    pub verifier: Option<String>,
+    /// As of the last step.
+    pub statistics: Statistics,
+    /// Control steps.
+    pub steps: u32,
+    /// Mean score of the executed candidates, when a verifier scored.
+    #[serde(deserialize_with = "single::maybe_one")]
+    pub score_mean: Option<f32>,
+    /// The simulator with its version.
+    pub simulator: String,
+}
+
+impl Message for EpisodeOutcome {
+    const NAME: &'static str = "outcome";
+    const BYTES_MAX: usize = OUTCOME_BYTES_MAX;
+
+    fn validate(&self) -> Result<(), String> {
+        value::name("run", &self.run)?;
+        value::name("task", &self.task)?;
+        value::name("variant", &self.variant)?;
+        value::range("seed", self.seed, 0, SEED_END - 1)?;
+        value::name("strategy", &self.strategy)?;
+        value::finite("temperature", &[self.temperature])?;
+        value::name("policy", &self.policy)?;
+        self.verifier.as_ref().map_or(Ok(()), |verifier| value::name("verifier", verifier))?;
+        self.score_mean.map_or(Ok(()), |score| value::finite("score_mean", &[score]))?;
+        value::text("simulator", &self.simulator)
+    }
+}

@@ -1,0 +1,102 @@
+//! What the holder of a session asks, one at a time.
+
+use serde::{Deserialize, Serialize};
+
+use super::{single, value};
+use crate::codec::Message;
+use crate::limits::{ACTION_LENGTH, REQUEST_BYTES_MAX, SEED_END, SLOTS_MAX};
+
+/// Everything that decides an episode's start.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Reset {
+    /// SIMPLER's name.
+    pub task: String,
+    /// `default`, or what is changed.
+    pub variant: String,
+    /// One of the fixed configurations; none draws a placement from the seed.
+    pub configuration: Option<u32>,
+    /// Below 2^53.
+    pub seed: u64,
+}
+
+/// Every request carries its number in the session: 1, 2, 3 and so on.
+///
+/// The same number again is answered with the same bytes again, a lower one with silence, a gap is refused.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub enum Request {
+    /// Starts an episode; ends the one before. Answered with `Observed`.
+    Reset {
+        /// This request's number.
+        sequence: u64,
+        /// SIMPLER's name.
+        task: String,
+        /// `default`, or what is changed.
+        variant: String,
+        /// One of the fixed configurations; none draws a placement from the seed.
+        configuration: Option<u32>,
+        /// Below 2^53.
+        seed: u64,
+    },
+    /// One control step. Answered with `Stepped`.
+    Step {
+        /// This request's number.
+        sequence: u64,
+        /// Translation in metres, rotation vector in radians, gripper +1 open or -1 closed; base frame.
+        #[serde(deserialize_with = "single::array")]
+        action: [f32; ACTION_LENGTH],
+    },
+    /// Keeps the state in a slot until the next `Reset`. Answered with `Saved`.
+    Save {
+        /// This request's number.
+        sequence: u64,
+        /// From 0.
+        slot: u32,
+    },
+    /// Goes back to the state in a slot, bit by bit. Answered with `Restored`.
+    Restore {
+        /// This request's number.
+        sequence: u64,
+        /// From 0.
+        slot: u32,
+    },
+    /// Ends the session. Answered with `Closed`.
+    Close {
+        /// This request's number.
+        sequence: u64,
+    },
+}
+
+impl Request {
+    /// The request's number.
+    pub fn sequence(&self) -> u64 {
+        match self {
+            Request::Reset { sequence, .. }
+            | Request::Step { sequence, .. }
+            | Request::Save { sequence, .. }
+            | Request::Restore { sequence, .. }
+            | Request::Close { sequence } => *sequence,
+        }
+    }
+}
+
+impl Message for Request {
+    const NAME: &'static str = "request";
+    const BYTES_MAX: usize = REQUEST_BYTES_MAX;
+
+    fn validate(&self) -> Result<(), String> {
+        value::sequence(self.sequence(), 1)?;
+        match self {
+            Request::Reset { task, variant, seed, .. } => {
+                value::name("task", task)?;
+                value::name("variant", variant)?;
+                value::range("seed", *seed, 0, SEED_END - 1)
+            }
+            Request::Step { action, .. } => value::finite("action", action),
+            Request::Save { slot, .. } | Request::Restore { slot, .. } => {
+                value::range("slot", (*slot).into(), 0, u64::from(SLOTS_MAX) - 1)
+            }
+            Request::Close { .. } => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! Checks of single values, worded once for every message.
+
+use crate::limits::{ELEMENTS_MAX, NAME_BYTES_MAX, TEXT_BYTES_MAX};
+use crate::{PROTOCOL_VERSION, limits};
+
+/// A name: not empty, not long.
+pub fn name(field: &str, value: &str) -> Result<(), String> {
+    if value.is_empty() || value.len() > NAME_BYTES_MAX {
+        return Err(format!("{field}: expected 1 to {NAME_BYTES_MAX} bytes, got {}", value.len()));
+    }
+    Ok(())
+}
+
+/// A text: not long.
+pub fn text(field: &str, value: &str) -> Result<(), String> {
+    if value.len() > TEXT_BYTES_MAX {
+        return Err(format!(
+            "{field}: expected at most {TEXT_BYTES_MAX} bytes, got {}",
+            value.len()
+        ));
+    }
+    Ok(())
+}
+
+/// A list that a peer may loop over.
+pub fn elements(field: &str, length: usize) -> Result<(), String> {
+    if length > ELEMENTS_MAX {
+        return Err(format!("{field}: expected at most {ELEMENTS_MAX} elements, got {length}"));
+    }
+    Ok(())
+}
+
+/// Numbers without NaN and infinity.
+pub fn finite(field: &str, values: &[f32]) -> Result<(), String> {
+    match values.iter().position(|value| !value.is_finite()) {
+        None => Ok(()),
+        Some(index) => Err(format!(
+            "{field}: expected finite numbers, got {} at index {index}",
+            words(values[index])
+        )),
+    }
+}
+
+/// A whole number in a range.
+pub fn range(field: &str, value: u64, low: u64, high: u64) -> Result<(), String> {
+    if !(low..=high).contains(&value) {
+        return Err(format!("{field}: expected {low} to {high}, got {value}"));
+    }
+    Ok(())
+}
+
+/// A request's number; 0 stands in a reply to a request that could not be read.
+pub fn sequence(value: u64, low: u64) -> Result<(), String> {
+    range("sequence", value, low, limits::SEED_END - 1)
+}
+
+/// The version of the peer.
+pub fn protocol(version: u32) -> Result<(), String> {
+    if version != PROTOCOL_VERSION {
+        return Err(format!("expected protocol {PROTOCOL_VERSION}, got protocol {version}"));
+    }
+    Ok(())
+}
+
+/// The version of a peer whose message may have other fields than ours.
+pub fn recognise_protocol(bytes: &[u8]) -> Result<(), String> {
+    #[derive(serde::Deserialize)]
+    struct Versioned {
+        protocol: u32,
+    }
+    match rmp_serde::from_slice::<Versioned>(bytes) {
+        Ok(versioned) => protocol(versioned.protocol),
+        // Not even a version: the strict decoder has better words for it.
+        Err(_) => Ok(()),
+    }
+}
+
+fn words(value: f32) -> &'static str {
+    match value {
+        value if value.is_nan() => "nan",
+        value if value > 0.0 => "inf",
+        _ => "-inf",
+    }
+}

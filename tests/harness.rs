@@ -1,0 +1,78 @@
+//! What every test of the processes needs: the built program, Python, and waits with a limit.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use agent::setup::{PythonEnvironment, development_environment};
+
+/// How often a condition is looked at while a test waits for it.
+const LOOK_MS: u64 = 20;
+
+/// The root of this checkout.
+pub fn repository() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the crate lies in the repository")
+}
+
+/// The program, built once with the profile of this test. Cargo builds it only for the crate that
+/// holds it, and tells its path to no other.
+pub fn rever() -> Command {
+    static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
+    Command::new(PROGRAM.get_or_init(|| {
+        let test = std::env::current_exe().expect("this test runs from a file");
+        let folder = test.ancestors().nth(2).expect("tests lie in target/<profile>/deps");
+        let mut build = cargo();
+        // With the whole workspace, features are resolved as they were for this test, so that no
+        // dependency is built a second time.
+        build.args(["build", "--quiet", "--workspace", "--bin", "rever"]);
+        if folder.ends_with("release") {
+            build.arg("--release");
+        }
+        succeed(&mut build);
+        folder.join("rever")
+    }))
+}
+
+/// The cargo that runs this test, in the repository.
+pub fn cargo() -> Command {
+    let mut cargo = Command::new(env!("CARGO"));
+    cargo.current_dir(repository());
+    cargo
+}
+
+/// Python with the servers' packages and the tools of the tests, and software OpenGL.
+pub fn python() -> &'static PythonEnvironment {
+    static ENVIRONMENT: OnceLock<PythonEnvironment> = OnceLock::new();
+    ENVIRONMENT.get_or_init(|| development_environment(repository()).expect("Python is set up"))
+}
+
+/// Runs the command to its end and returns its standard output.
+pub fn succeed(command: &mut Command) -> String {
+    let output = run(command);
+    assert!(output.status.success(), "{command:?} ended with {}\n{}", output.status, text(&output));
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// Runs the command to its end.
+pub fn run(command: &mut Command) -> Output {
+    command.output().unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"))
+}
+
+/// All that a command said.
+pub fn text(output: &Output) -> String {
+    let (stdout, stderr) = (&output.stdout, &output.stderr);
+    format!("{}{}", String::from_utf8_lossy(stdout), String::from_utf8_lossy(stderr))
+}
+
+/// Waits until the condition gives a value, and fails after the limit.
+pub fn wait_for<T>(what: &str, limit: Duration, mut condition: impl FnMut() -> Option<T>) -> T {
+    let deadline = Instant::now() + limit;
+    loop {
+        if let Some(value) = condition() {
+            return value;
+        }
+        assert!(Instant::now() < deadline, "waited {} s for {what}", limit.as_secs());
+        std::thread::park_timeout(Duration::from_millis(LOOK_MS));
+    }
+}

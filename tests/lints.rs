@@ -1,0 +1,48 @@
+//! Formats, lints and types of both languages; a warning fails.
+
+use crate::harness::{cargo, python, repository, succeed};
+
+/// The folders with Python in them.
+const PYTHON_FOLDERS: [&str; 2] = ["env-server", "agent/training"];
+
+#[test]
+fn rust_is_formatted() {
+    succeed(cargo().args(["fmt", "--all", "--check"]));
+}
+
+#[test]
+fn rust_has_no_warnings() {
+    let mut clippy = cargo();
+    clippy.args(["clippy", "--quiet", "--workspace", "--all-targets"]);
+    if !cfg!(debug_assertions) {
+        clippy.arg("--release");
+    }
+    succeed(clippy.args(["--", "-D", "warnings"]));
+}
+
+#[test]
+fn python_is_formatted_and_has_no_warnings() {
+    for verb in [&["check"][..], &["format", "--check"]] {
+        let mut ruff = python().command();
+        ruff.current_dir(repository()).args(["-m", "ruff"]).args(verb).arg("--no-cache");
+        succeed(ruff.args(PYTHON_FOLDERS));
+    }
+}
+
+#[test]
+fn python_types_are_right() {
+    let mut mypy = python().command();
+    mypy.current_dir(repository().join("env-server"));
+    succeed(mypy.args(["-m", "mypy", "--strict", "rever_env", "tests"]));
+}
+
+#[test]
+fn types_of_the_training_are_right_as_far_as_they_are_known() {
+    let mut mypy = python().command();
+    mypy.current_dir(repository().join("agent/training"));
+    mypy.args(["-m", "mypy", "--strict", "."]);
+    // PyTorch is several times larger than all else that the tests install. Without it, what comes
+    // from it is of any type.
+    mypy.args(["--ignore-missing-imports", "--no-warn-unused-ignores", "--no-warn-return-any"]);
+    succeed(mypy.args(["--allow-subclassing-any", "--allow-untyped-decorators"]));
+}

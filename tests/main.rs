@@ -1,0 +1,27 @@
+//! The processes together. One binary: each file under `tests/` would be linked again on its own.
+
+// What the tests below share: the built program, a run of it, a server, a bad wire.
+mod evaluation;
+mod harness;
+mod relay;
+mod server;
+
+// The repository: its text, its README, its formats, lints and types.
+mod lints;
+mod readme;
+mod tidy;
+
+// The container files.
+mod containers;
+
+// The Python package's own tests.
+mod python;
+
+// The real client against real servers, on good wires and bad ones.
+mod wire;
+
+// Evaluations with the models that come with the program: results, kills, faults, the report.
+mod whole_loop;
+
+// A new verifier while a run goes on.
+mod hot_swap;

@@ -1,0 +1,200 @@
+//! The whole loop with the models that come with the program: four tasks, two strategies, real servers.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::sync::OnceLock;
+
+use agent::labels::LabelStore;
+use agent::record::EpisodeRecord;
+use agent::suite::TASKS;
+use serde_json::Value;
+
+use crate::evaluation::{Evaluation, WAIT, is_alive, kill};
+use crate::harness::{rever, succeed, wait_for};
+
+/// One episode per task and strategy: the longest task lasts twice as long as the others, so that
+/// some episodes are recorded while others are still in the middle.
+const ARGUMENTS: [&str; 6] = [
+    "--strategies=sample,verifier",
+    "--candidates=3",
+    "--episodes=1",
+    "--placements=random",
+    "--seed=7",
+    "--sessions=8",
+];
+const EPISODES: usize = TASKS.len() * 2;
+
+/// A run that nothing disturbed, made once for all tests that compare with it.
+fn undisturbed() -> &'static (Evaluation, Value) {
+    static RUN: OnceLock<(Evaluation, Value)> = OnceLock::new();
+    RUN.get_or_init(|| {
+        let evaluation = Evaluation::new(&fresh_folder("undisturbed"), &ARGUMENTS);
+        let result = evaluation.finish();
+        (evaluation, result)
+    })
+}
+
+/// Emptied at the start of the test and left for a look afterwards.
+fn fresh_folder(name: &str) -> std::path::PathBuf {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    if folder.exists() {
+        std::fs::remove_dir_all(&folder).expect("the last run's files can be removed");
+    }
+    std::fs::create_dir_all(&folder).expect("a folder can be made");
+    folder
+}
+
+#[test]
+fn every_episode_leaves_a_record_and_a_label() {
+    let (evaluation, _) = undisturbed();
+    let records = evaluation.records();
+    assert_eq!(records.len(), EPISODES);
+    for (id, record) in &records {
+        assert_eq!(record.steps.len(), steps_max(&record.identity.task), "{id}");
+        let candidates = if record.identity.strategy == "sample" { 1 } else { 3 };
+        for step in &record.steps {
+            assert_eq!(step.candidates.len(), candidates, "{id}");
+            let scored = step.candidates.iter().filter(|candidate| candidate.score.is_some());
+            let expected = step.candidates.iter().filter(|candidate| candidate.action.is_some());
+            if candidates > 1 {
+                assert_eq!(scored.count(), expected.count(), "{id}: the well-formed are scored");
+            }
+        }
+    }
+    assert_eq!(labelled(evaluation), records.keys().cloned().collect());
+}
+
+#[test]
+fn the_result_file_has_the_documented_shape() {
+    let (_, result) = undisturbed();
+    assert_eq!(keys(result), ["decision_ms", "headroom", "paired", "rows", "versions"]);
+    assert_eq!(keys(&result["decision_ms"]), ["p50", "p95"]);
+    let rows = result["rows"].as_array().expect("rows");
+    // One per task and one for all, for each strategy.
+    assert_eq!(rows.len(), (TASKS.len() + 1) * 2);
+    for row in rows {
+        for key in ["task", "variant", "strategy"] {
+            assert!(row[key].is_string(), "{key} in {row}");
+        }
+        for key in ["candidates", "episodes", "faults"] {
+            assert!(row[key].is_u64(), "{key} in {row}");
+        }
+        for key in ["grasp", "success", "success_low", "success_high"] {
+            assert!(
+                row[key].as_f64().is_some_and(|rate| (0.0..=1.0).contains(&rate)),
+                "{key} in {row}"
+            );
+        }
+    }
+    let paired = result["paired"].as_array().expect("paired");
+    let gain = paired.iter().find(|pair| pair["a"] == "verifier" && pair["b"] == "sample");
+    let gain = gain.expect("the verifier is compared with one sample");
+    assert_eq!(gain["episodes"], TASKS.len());
+    assert!(["gain", "low", "high"].iter().all(|key| gain[*key].is_f64()), "{gain}");
+}
+
+#[test]
+fn a_killed_run_goes_on_where_it_was() {
+    let (undisturbed, expected) = undisturbed();
+    let evaluation = Evaluation::new(&fresh_folder("killed"), &ARGUMENTS);
+    let mut running = evaluation.start();
+    evaluation.wait_for_records(&mut running, 1);
+    let servers = running.servers();
+    assert!(!servers.is_empty());
+    running.kill();
+    wait_for("the end of the servers of a killed agent", WAIT, || {
+        (!servers.iter().copied().any(is_alive)).then_some(())
+    });
+    let before = evaluation.record_files();
+    assert!((1..EPISODES).contains(&before.len()), "killed in the middle, with {}", before.len());
+
+    let result = evaluation.finish();
+    let after = evaluation.record_files();
+    assert!(before.iter().all(|(name, bytes)| after.get(name) == Some(bytes)), "none is run again");
+    assert_same_episodes(&evaluation, undisturbed);
+    assert_eq!((&result["rows"], &result["paired"]), (&expected["rows"], &expected["paired"]));
+}
+
+#[test]
+fn episodes_of_a_killed_server_are_run_again_and_leave_one_label() {
+    let (undisturbed, _) = undisturbed();
+    let evaluation =
+        Evaluation::new(&fresh_folder("fault"), &[&ARGUMENTS[..], &["--servers=1"]].concat());
+    let mut running = evaluation.start();
+    // The short episodes are recorded, so the long ones are in the middle.
+    evaluation.wait_for_records(&mut running, 1);
+    let [server] = running.servers()[..] else { panic!("one server was asked for") };
+    kill(server);
+    assert!(running.succeeds(), "{}", evaluation.words());
+
+    let faults = agent::run::faults(&evaluation.run_folder()).expect("a list of faults");
+    assert!(!faults.is_empty(), "no episode broke: {}", evaluation.words());
+    let result = evaluation.finish();
+    let averages = result["rows"].as_array().expect("rows").iter();
+    let counted = averages.filter(|row| row["task"] == "average").map(|row| row["faults"].as_u64());
+    assert_eq!(counted.sum::<Option<u64>>(), Some(faults.len() as u64), "faults are counted");
+    assert_same_episodes(&evaluation, undisturbed);
+    assert_eq!(labelled(&evaluation), evaluation.records().keys().cloned().collect());
+}
+
+#[test]
+fn the_report_shows_every_episode() {
+    let (evaluation, _) = undisturbed();
+    let out = fresh_folder("report");
+    succeed(rever().arg("report").arg(evaluation.run_folder()).arg("--out").arg(&out));
+    let page = std::fs::read_to_string(out.join("index.html")).expect("a page");
+    assert!(!page.contains("http://") && !page.contains("https://"), "it opens offline");
+    let mut written = String::new();
+    collect_text(&out, &mut written);
+    for id in evaluation.records().keys() {
+        assert!(written.contains(id.as_str()), "{id} is in the report");
+    }
+}
+
+/// Same candidates, same choices, same outcomes; names of the runs and times differ.
+fn assert_same_episodes(ours: &Evaluation, theirs: &Evaluation) {
+    let (ours, theirs) = (ours.records(), theirs.records());
+    assert!(ours.keys().eq(theirs.keys()));
+    for (id, record) in &ours {
+        let other = &theirs[id];
+        let steps = |record: &EpisodeRecord| {
+            let mut steps = record.steps.clone();
+            for step in &mut steps {
+                (step.decision_ms, step.step_ms) = (0.0, 0.0);
+            }
+            steps
+        };
+        assert_eq!(record.statistics, other.statistics, "{id}");
+        assert!(steps(record) == steps(other), "{id}: the same seeds give the same episode");
+    }
+}
+
+/// The ids of all labels, each of which is there once.
+fn labelled(evaluation: &Evaluation) -> BTreeSet<String> {
+    let store = LabelStore::open(&evaluation.labels()).expect("a label store");
+    let labels = store.labels().expect("its labels");
+    let ids: BTreeSet<String> = labels.iter().map(|label| label.id.clone()).collect();
+    assert_eq!(ids.len(), labels.len(), "a label is there twice");
+    ids
+}
+
+/// Episodes last as long as their task's horizon, success or not.
+fn steps_max(task: &str) -> usize {
+    if task == "widowx_put_eggplant_in_basket" { 120 } else { 60 }
+}
+
+fn keys(value: &Value) -> Vec<&str> {
+    value.as_object().expect("an object").keys().map(String::as_str).collect()
+}
+
+fn collect_text(folder: &Path, into: &mut String) {
+    for entry in std::fs::read_dir(folder).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        into.push_str(&path.to_string_lossy());
+        if path.is_dir() {
+            collect_text(&path, into);
+        } else if let Ok(text) = std::fs::read_to_string(&path) {
+            into.push_str(&text);
+        }
+    }
+}

@@ -1,0 +1,399 @@
+//! The real client against real servers over zenoh, on good wires and bad ones.
+
+use std::collections::BTreeSet;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use agent::wire::{
+    Environment, EnvironmentFault, Network, NetworkOptions, OutcomePublisher, OutcomeSubscriber,
+    Timing, VerifierPublisher, VerifierSubscriber,
+};
+use protocol::{
+    EpisodeOutcome, Open, Opening, PROTOCOL_VERSION, Reply, Reset, Statistics, decode, encode,
+};
+
+use crate::harness::repository;
+use crate::relay::{Badness, Relay};
+use crate::server::{Server, free_endpoint};
+
+/// Longest wait for what takes a server a moment; a test machine may be busy.
+const WAIT: Duration = Duration::from_secs(60);
+
+fn open() -> Open {
+    Open {
+        protocol: PROTOCOL_VERSION,
+        task: "widowx_spoon_on_towel".into(),
+        variant: "default".into(),
+        image_height: 64,
+        image_width: 64,
+        expert: true,
+        holder: "test".into(),
+    }
+}
+
+fn reset(task: &str, configuration: Option<u32>) -> Reset {
+    Reset { task: task.into(), variant: "default".into(), configuration, seed: 2_000_000_007 }
+}
+
+fn spoon() -> Reset {
+    reset("widowx_spoon_on_towel", Some(5))
+}
+
+async fn listen(fleet: &str) -> Network {
+    let options = NetworkOptions { fleet: fleet.into(), ..NetworkOptions::default() };
+    Network::open(options).await.expect("the network opens")
+}
+
+/// A network that others can reach, and a server that has reached it.
+async fn network_with_server(fleet: &str, arguments: &[&str]) -> (Network, Server) {
+    let network = listen(fleet).await;
+    let server = Server::start(&network.listening()[0], fleet, arguments);
+    assert_eq!(network.servers(1, WAIT).await.len(), 1, "the server describes itself");
+    (network, server)
+}
+
+/// A network that reaches the server beside the one that listens for it.
+async fn connect(server: &Server, fleet: &str) -> Network {
+    let connect = vec![server.endpoint.clone()];
+    let options = NetworkOptions { connect, fleet: fleet.into(), ..NetworkOptions::default() };
+    Network::open(options).await.expect("the network opens")
+}
+
+/// The agent's side of a relay.
+async fn connect_through(endpoint: &str, timing: Timing) -> Network {
+    let (connect, fleet) = (vec![endpoint.to_owned()], "agents".to_owned());
+    let options = NetworkOptions { connect, fleet, timing, ..NetworkOptions::default() };
+    let network = Network::open(options).await.expect("the network opens");
+    assert_eq!(network.servers(1, WAIT).await.len(), 1, "the server is seen through the relay");
+    network
+}
+
+/// A peer without any of our code.
+async fn stranger_to(server: &Server) -> zenoh::Session {
+    let mut configuration = zenoh::Config::default();
+    let endpoints = format!("[\"{}\"]", server.endpoint);
+    for (key, value) in [
+        ("mode", "\"client\""),
+        ("connect/endpoints", &endpoints),
+        ("scouting/multicast/enabled", "false"),
+    ] {
+        configuration.insert_json5(key, value).expect("zenoh has this option");
+    }
+    zenoh::open(configuration).await.expect("the stranger connects")
+}
+
+/// Two episodes with everything that an agent can ask, as bytes.
+async fn trajectory(network: &Network, server: &str) -> Result<Vec<Vec<u8>>, EnvironmentFault> {
+    let mut bytes = Vec::new();
+    let environment = Environment::open(network, server, open()).await?;
+    let mut episode = environment.reset(spoon()).await?;
+    let observed = |observation: &protocol::Observation| {
+        encode(&Reply::Observed { sequence: 1, observation: observation.clone() })
+            .expect("a valid observation")
+    };
+    bytes.push(observed(episode.observation()));
+    for step in 0..12 {
+        if step == 6 {
+            episode.save(2).await?;
+        }
+        let action = episode.observation().expert_action.expect("the expert was asked for");
+        let transition = episode.step(action).await?;
+        bytes
+            .push(encode(&Reply::Stepped { sequence: 1, transition }).expect("a valid transition"));
+    }
+    episode.restore(2).await?;
+    bytes.push(observed(episode.observation()));
+    for _ in 0..3 {
+        let transition = episode.step([0.01, 0.0, -0.005, 0.0, 0.0, 0.1, 1.0]).await?;
+        bytes
+            .push(encode(&Reply::Stepped { sequence: 1, transition }).expect("a valid transition"));
+    }
+    let episode = episode.finish().reset(reset("widowx_stack_cube", None)).await?;
+    bytes.push(observed(episode.observation()));
+    episode.finish().close().await?;
+    Ok(bytes)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bad_wire_ends_in_the_same_bytes_as_a_good_one() {
+    let (network, server) = network_with_server("good", &[]).await;
+    let clean = trajectory(&network, &server.id).await.expect("a good wire");
+    drop(server);
+    let endpoint = free_endpoint();
+    let badness = Badness { dropped: 150, doubled: 200, delay_ms_max: 60 };
+    let relay = Relay::start(&endpoint, 7, badness).await;
+    let server = Server::start(&endpoint, "servers", &[]);
+    let timing = Timing {
+        resend: Duration::from_millis(40),
+        resend_max: Duration::from_millis(200),
+        ..Timing::default()
+    };
+    let network = connect_through(&endpoint, timing).await;
+    for _ in 0..3 {
+        let lossy = trajectory(&network, &server.id).await.expect("a bad wire loses nothing");
+        assert_eq!(lossy.len(), clean.len());
+        for (index, (lossy, clean)) in lossy.iter().zip(&clean).enumerate() {
+            assert!(lossy == clean, "message {index} differs");
+        }
+    }
+    let deeds = relay.deeds();
+    for (name, count) in
+        [("dropped", &deeds.dropped), ("doubled", &deeds.doubled), ("overtaken", &deeds.overtaken)]
+    {
+        let count = count.load(Ordering::SeqCst);
+        assert!(count >= 5, "only {count} messages were {name}: the wire was not bad");
+    }
+    relay.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_killed_server_is_a_fault_within_seconds_and_another_one_gives_the_same_bytes() {
+    let (network, mut first) = network_with_server("killed", &[]).await;
+    let second = Server::start(&network.listening()[0], "killed", &[]);
+    let whole = trajectory(&network, &first.id).await.expect("the first server lives");
+    let environment = Environment::open(&network, &first.id, open()).await.expect("a session");
+    let mut episode = environment.reset(spoon()).await.expect("an episode");
+    episode.step([0.0; 7]).await.expect("the first server lives");
+    first.kill();
+    let killed_at = Instant::now();
+    let fault = loop {
+        match episode.step([0.0; 7]).await {
+            Ok(_) => assert!(killed_at.elapsed() < WAIT, "a dead server answers"),
+            Err(fault) => break fault,
+        }
+    };
+    assert_eq!(fault, EnvironmentFault::ServerLost { server: first.id.clone() });
+    assert!(
+        killed_at.elapsed() < Duration::from_secs(5),
+        "the fault took {:?}",
+        killed_at.elapsed()
+    );
+    let left: Vec<_> =
+        network.servers(1, WAIT).await.into_iter().map(|server| server.server).collect();
+    assert_eq!(left, std::slice::from_ref(&second.id));
+    let again = trajectory(&network, &second.id).await.expect("the second server lives");
+    assert!(again == whole, "another server gave other bytes");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stuck_simulation_times_out_though_its_token_stands() {
+    let endpoint = free_endpoint();
+    let relay =
+        Relay::start(&endpoint, 1, Badness { dropped: 0, doubled: 0, delay_ms_max: 0 }).await;
+    let server = Server::start(&endpoint, "servers", &[]);
+    let timing = Timing { silence_max: Duration::from_secs(3), ..Timing::default() };
+    let network = connect_through(&endpoint, timing).await;
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let mut episode = environment.reset(spoon()).await.expect("an episode");
+    relay.get_stuck();
+    let fault = episode.step([0.0; 7]).await.expect_err("nothing passes");
+    let EnvironmentFault::TimedOut { asked: "Step", waited_secs: 3..=10, .. } = fault else {
+        panic!("expected to time out after 3 s, got {fault:?}")
+    };
+    relay.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_session_dies_with_its_holder() {
+    let (network, server) = network_with_server("holder", &["--sessions", "1"]).await;
+    let holder = connect(&server, "holder").await;
+    assert_eq!(holder.servers(1, WAIT).await.len(), 1, "the server describes itself");
+    let environment = Environment::open(&holder, &server.id, open()).await.expect("a session");
+    let fault =
+        Environment::open(&network, &server.id, open()).await.expect_err("one session at once");
+    assert_eq!(fault, EnvironmentFault::Refused { reason: "all 1 sessions are in use".into() });
+    let mut episode = environment.reset(spoon()).await.expect("an episode");
+    episode.step([0.0; 7]).await.expect("a step");
+    drop(episode);
+    assert_eq!(sessions_become(&network, 0).await, 0, "a dropped session lives on");
+    let environment = Environment::open(&holder, &server.id, open()).await.expect("it is free");
+    let _episode = environment.reset(spoon()).await.expect("an episode");
+    assert_eq!(sessions_become(&network, 1).await, 1, "the session is not counted");
+    holder.close().await.expect("the holder goes");
+    assert_eq!(sessions_become(&network, 0).await, 0, "the session lives on without its holder");
+    Environment::open(&network, &server.id, open()).await.expect("the session is free again");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_idle_session_ends_and_says_so() {
+    let (network, server) = network_with_server("idle", &["--idle-secs", "1"]).await;
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let mut episode = environment.reset(spoon()).await.expect("an episode");
+    assert_eq!(sessions_become(&network, 0).await, 0, "the session does not end");
+    let fault = episode.step([0.0; 7]).await.expect_err("the session has ended");
+    let EnvironmentFault::Refused { reason } = &fault else {
+        panic!("expected a refusal, got {fault:?}")
+    };
+    assert!(reason.ends_with("ended: no request came for 1 s"), "{reason}");
+}
+
+/// Asks until the server has that many sessions in use; returns what it had last.
+async fn sessions_become(network: &Network, expected: u32) -> u32 {
+    let deadline = Instant::now() + WAIT;
+    loop {
+        let sessions = network.servers(1, WAIT).await[0].sessions;
+        if sessions == expected || Instant::now() > deadline {
+            return sessions;
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn wrong_requests_are_refused_in_words_and_leave_the_world_as_it_was() {
+    let (network, server) = network_with_server("wrong", &[]).await;
+    let check = |result: Result<(), EnvironmentFault>, words: &str| match result {
+        Err(EnvironmentFault::Refused { reason }) => assert!(reason.contains(words), "{reason}"),
+        other => panic!("expected a refusal with {words:?}, got {other:?}"),
+    };
+    let unknown = Open { task: "widowx_fold_towel".into(), ..open() };
+    let opened = Environment::open(&network, &server.id, unknown).await.map(drop);
+    check(opened, "got widowx_fold_towel (default)");
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let far = environment.reset(reset("widowx_stack_cube", Some(24))).await.map(drop);
+    check(far, "24");
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let mut episode = environment.reset(spoon()).await.expect("an episode");
+    check(
+        episode.step([f32::NAN; 7]).await.map(drop),
+        "action: expected finite numbers, got nan at index 0",
+    );
+    check(episode.restore(3).await, "slot: expected one of [], got 3");
+    check(episode.save(16).await, "slot: expected 0 to 15, got 16");
+    let first = episode.step([0.0; 7]).await.expect("the episode goes on");
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let mut undisturbed = environment.reset(spoon()).await.expect("an episode");
+    assert!(
+        undisturbed.step([0.0; 7]).await.expect("a step") == first,
+        "a refused request changed the world"
+    );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_no_client_of_ours_would_send_is_refused_in_words() {
+    let (network, server) = network_with_server("strange", &[]).await;
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let session = environment.session().to_owned();
+    let episode = environment.reset(spoon()).await.expect("an episode");
+    let stranger = stranger_to(&server).await;
+    let golden = |name: &str| {
+        std::fs::read(repository().join("protocol/golden").join(name))
+            .expect("the golden file is there")
+    };
+    let replies = stranger
+        .declare_subscriber(format!("rever/1/strange/session/{session}/reply"))
+        .await
+        .expect("a subscriber");
+    for (request, sequence, words) in [
+        (vec![0xc0; 1025], 0, "request has 1025 bytes, limit 1024"),
+        (golden("refused/trailing.msgpack"), 0, "got 1 more bytes"),
+        (
+            golden("refused/nan.msgpack"),
+            2,
+            "request is invalid: action: expected finite numbers, got nan at index 5",
+        ),
+        (golden("request_restore.msgpack"), 70_000, "sequence: expected 3, got 70000"),
+    ] {
+        stranger
+            .put(format!("rever/1/strange/session/{session}/request"), request)
+            .await
+            .expect("sent");
+        let sample = tokio::time::timeout(WAIT, replies.recv_async())
+            .await
+            .expect("an answer")
+            .expect("a sample");
+        let reply: Reply = decode(&sample.payload().to_bytes()).expect("a reply");
+        let Reply::Refused { sequence: number, reason } = reply else {
+            panic!("expected a refusal, got {reply:?}")
+        };
+        assert!(number == sequence && reason.contains(words), "{number}: {reason}");
+    }
+    for (payload, words) in [
+        (
+            golden("refused/protocol_and_fields.msgpack"),
+            "open is invalid: expected protocol 1, got protocol 2",
+        ),
+        (vec![0xc0; 1025], "open has 1025 bytes, limit 1024"),
+    ] {
+        let key = format!("rever/1/strange/server/{}/open", server.id);
+        let answers = stranger.get(key).payload(payload).timeout(WAIT).await.expect("asked");
+        let sample =
+            answers.recv_async().await.expect("an answer").into_result().expect("a sample");
+        let opening: Opening = decode(&sample.payload().to_bytes()).expect("an opening");
+        assert_eq!(opening, Opening::Refused { reason: words.into() });
+    }
+    drop(episode);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn outcomes_reach_those_who_come_early_and_those_who_come_late() {
+    let source = listen("outcomes").await;
+    let connect = source.listening().to_vec();
+    let options = NetworkOptions { connect, fleet: "outcomes".into(), ..NetworkOptions::default() };
+    let reader = Network::open(options).await.expect("the network opens");
+    let mut early = OutcomeSubscriber::declare(&reader, None).await.expect("a subscriber");
+    let publisher = OutcomePublisher::declare(&source, "run-1").await.expect("a publisher");
+    for episode in 0..200 {
+        publisher.publish(&outcome("run-1", episode)).await.expect("published");
+    }
+    publisher.publish(&outcome("run-2", 0)).await.expect_err("an outcome of another run");
+    let mut late = OutcomeSubscriber::declare(&reader, Some("run-1")).await.expect("a subscriber");
+    for subscriber in [&mut early, &mut late] {
+        // What is live may overtake what is cached: readers key outcomes by episode, not by order.
+        let mut missing: BTreeSet<u32> = (0..200).collect();
+        while !missing.is_empty() {
+            let next = tokio::time::timeout(WAIT, subscriber.next())
+                .await
+                .expect("in time")
+                .expect("an outcome");
+            assert_eq!(next, outcome("run-1", next.episode));
+            missing.remove(&next.episode);
+        }
+    }
+}
+
+fn outcome(run: &str, episode: u32) -> EpisodeOutcome {
+    EpisodeOutcome {
+        run: run.into(),
+        task: "widowx_spoon_on_towel".into(),
+        variant: "default".into(),
+        configuration: None,
+        seed: 1_000_000_000 + u64::from(episode),
+        episode,
+        strategy: "sample".into(),
+        candidates: 1,
+        temperature: 1.0,
+        policy: "p".repeat(64),
+        verifier: None,
+        statistics: Statistics { is_success: episode.is_multiple_of(2), ..Statistics::default() },
+        steps: 60,
+        score_mean: None,
+        simulator: "rever_env".into(),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_last_verifier_is_kept_for_late_comers() {
+    let source = listen("verifiers").await;
+    let connect = source.listening().to_vec();
+    let options =
+        NetworkOptions { connect, fleet: "verifiers".into(), ..NetworkOptions::default() };
+    let reader = Network::open(options).await.expect("the network opens");
+    let publisher = VerifierPublisher::declare(&source, "default").await.expect("a publisher");
+    for version in 1..=3 {
+        publisher.publish("policy", vec![version; 200_000]).await.expect("published");
+    }
+    let subscriber = VerifierSubscriber::declare(&reader, "default").await.expect("a subscriber");
+    let mut latest = subscriber.latest();
+    for version in [3, 4] {
+        if version == 4 {
+            publisher.publish("policy", vec![version; 200_000]).await.expect("published");
+        }
+        let is_version = |update: &Option<std::sync::Arc<protocol::VerifierUpdate>>| {
+            update.as_ref().is_some_and(|update| update.weights == vec![version; 200_000])
+        };
+        tokio::time::timeout(WAIT, latest.wait_for(is_version))
+            .await
+            .expect("in time")
+            .expect("a version");
+    }
+}
