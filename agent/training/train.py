@@ -57,6 +57,7 @@ class Options:
     begin_with: Path | None
     checkpoint_seconds: float
     evaluate_seconds: float
+    precision: str
     compiled: bool
 
 
@@ -254,7 +255,9 @@ def loss_function(
 
     def loss(image: Tensor, prompt: Tensor, context: Tensor, completion: Tensor) -> Tensor:
         tokens = torch.cat([prompt, context[:, :-1]], dim=1)
-        logits = network(image, tokens, start)
+        with torch.autocast("cpu", torch.bfloat16, enabled=options.precision == "bf16"):
+            logits = network(image, tokens, start)
+        logits = logits.float()
         answer = completion + half
         targets = table[answer]
         # (batch, completion tokens)
@@ -293,6 +296,9 @@ def parse(arguments: list[str]) -> Options:
     parser.add_argument("--begin-with", type=Path, help="state.pt of an earlier run")
     parser.add_argument("--checkpoint-seconds", type=float, default=120.0)
     parser.add_argument("--evaluate-seconds", type=float, default=300.0)
+    parser.add_argument(
+        "--precision", choices=("bf16", "f32"), default="bf16", help="of products; weights are f32"
+    )
     parser.add_argument("--eager", dest="compiled", action="store_false")
     return Options(**vars(parser.parse_args(arguments)))
 

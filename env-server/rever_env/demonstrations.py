@@ -197,13 +197,14 @@ def demonstrate(
     ]
     started = time.monotonic()
     total = episodes * len(tasks)
-    before = _files(tasks, out)
+    seeds = range(seed, seed + episodes)
+    before = _recorded(tasks, seeds, out)
     # Fresh processes: an OpenGL context does not survive a fork.
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(record_share, share) for share in shares]
         while not all(future.done() for future in futures):
             wait(futures, timeout=_REPORT_SECONDS)
-            done = _files(tasks, out)
+            done = _recorded(tasks, seeds, out)
             seconds = time.monotonic() - started
             left = (total - done) * seconds / max(done - before, 1)
             report(f"{done} of {total} episodes, {seconds:.0f} s, about {left:.0f} s left")
@@ -217,9 +218,10 @@ def demonstrate(
     }
 
 
-def _files(tasks: list[Task], out: Path) -> int:
+def _recorded(tasks: list[Task], seeds: range, out: Path) -> int:
+    """How many of the episodes are there; the directory may hold those of other seeds as well."""
     return sum(
-        entry.suffix in (".npz", ".failed")
+        entry.suffix in (".npz", ".failed") and int(entry.stem) in seeds
         for task in tasks
         for entry in (out / task.name).iterdir()
     )
