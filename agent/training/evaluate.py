@@ -1,4 +1,4 @@
-"""What a checkpoint knows on held-out episodes, with the truth as context (teacher forcing).
+"""What a checkpoint knows on held-out episodes: with the truth as context, and on its own text.
 
 python agent/training/evaluate.py --model DIR --demonstrations DIR [--json FILE]
 """
@@ -18,6 +18,7 @@ import checkpoint
 import dataset
 import demonstration
 from actions import DIMENSIONS, Statistics, actions_from_digits, world_from_model
+from generation import generate
 from network import Network
 from tokenizer import COORDINATE_LEVELS, COORDINATE_STEP_PIXELS, FIRST_COORDINATE_ID, Tokenizer
 
@@ -41,8 +42,9 @@ class HeldOut:
     # Mean absolute error of the turn about z.
     yaw_error_degrees: float
     gripper_accuracy: float
-    # Cross-entropy of the words, coordinates and actions against hard targets, nats a token.
-    loss: float
+    # Cross-entropy of the words, coordinates and actions against hard targets, nats a token;
+    # none where the model read its own text.
+    loss: float | None
 
 
 def main() -> None:
@@ -58,7 +60,11 @@ def main() -> None:
     measured = measure_held_out(
         policy.network, policy.tokenizer, policy.statistics, frames, arguments.frames
     )
-    text = json.dumps(asdict(measured), indent=2)
+    own = measure_own_text(
+        policy.network, policy.tokenizer, policy.statistics, frames, arguments.frames
+    )
+    described = {"truth_as_context": asdict(measured), "own_text": asdict(own)}
+    text = json.dumps(described, indent=2)
     print(text)
     if arguments.json:
         arguments.json.write_text(text + "\n", encoding="utf-8")
@@ -73,7 +79,7 @@ def measure_held_out(
     count: int,
 ) -> HeldOut:
     """Over at most `count` frames, evenly spread."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(np.int64))
+    chosen = spread(frames, count)
     start = network.config.vision.patches + frames.prompt.shape[1] - 1
     answers, losses = [], []
     for indices in np.array_split(chosen, max(1, len(chosen) // BATCH)):
@@ -87,13 +93,39 @@ def measure_held_out(
     return compare(answer, truth, frames.action[chosen], tokenizer, statistics, loss)
 
 
+@torch.no_grad()
+def measure_own_text(
+    network: Network,
+    tokenizer: Tokenizer,
+    statistics: Statistics,
+    frames: dataset.Frames,
+    count: int,
+) -> HeldOut:
+    """Greedy completions, each token read back by the next: what the policy does when it acts."""
+    chosen = spread(frames, count)
+    answers = []
+    for indices in np.array_split(chosen, max(1, len(chosen) // BATCH)):
+        image, prompt, completion = frames.batch(indices)
+        length = completion.shape[1]
+        answers.append(generate(network, image, prompt, length, 0.0, torch.Generator()).numpy())
+    answer = np.concatenate(answers)
+    truth = frames.completion[chosen]
+    return compare(answer, truth, frames.action[chosen], tokenizer, statistics, None)
+
+
+def spread(frames: dataset.Frames, count: int) -> NDArray[np.int64]:
+    """Indices of at most `count` frames, evenly spread."""
+    places = np.linspace(0, len(frames) - 1, min(count, len(frames)))
+    return np.unique(places.astype(np.int64))
+
+
 def compare(
     answer: NDArray[np.int64],
     truth: NDArray[np.int64],
     action: NDArray[np.float32],
     tokenizer: Tokenizer,
     statistics: Statistics,
-    loss: float,
+    loss: float | None,
 ) -> HeldOut:
     # The kind of token at a place is the same in every completion.
     row = truth[0]

@@ -9,10 +9,12 @@ use rayon::prelude::*;
 
 use super::backend::vectorised;
 
-/// Outputs per panel: two vectors of eight.
+/// Outputs per panel: two vectors of eight, or one of sixteen.
 const PANEL: usize = 16;
-/// Rows per tile: 6 x 16 accumulators fill twelve of the sixteen vector registers.
+/// Rows per tile: 6 x 16 accumulators fill twelve of AVX2's sixteen vector registers.
 const TILE: usize = 6;
+/// Panels per tile with AVX-512: twelve accumulators again, and each weight read once for six rows.
+const WIDE_PANELS: usize = 2;
 /// Rows per task: with 256 inputs they stay in the second-level cache while panels stream by.
 const TASK_ROWS: usize = 96;
 /// Multiply-adds per task below which another thread costs more than it brings.
@@ -107,46 +109,67 @@ impl Product<'_> {
         }
     }
 
-    /// All tiles of some rows and some panels.
+    /// All tiles of some rows and some panels, `PANELS` panels at a time.
     #[inline(always)]
-    fn rectangle(&self, rows: Range<usize>, panels: Range<usize>) {
+    fn rectangle<const PANELS: usize>(&self, rows: Range<usize>, panels: Range<usize>) {
+        let whole = panels.len() / PANELS * PANELS;
+        let (most, rest) = (panels.start..panels.start + whole, panels.start + whole..panels.end);
+        for panel in most.step_by(PANELS) {
+            self.column::<PANELS>(rows.clone(), panel);
+        }
+        for panel in rest {
+            self.column::<1>(rows.clone(), panel);
+        }
+    }
+
+    /// All tiles of some rows and `PANELS` panels.
+    #[inline(always)]
+    fn column<const PANELS: usize>(&self, rows: Range<usize>, panel: usize) {
         let tiles = rows.len().div_ceil(TILE);
-        for panel in panels {
-            for tile in 0..tiles {
-                let part = even_part(rows.len(), tiles, tile);
-                let first = rows.start + part.start;
-                match part.len() {
-                    1 => self.tile::<1>(first, panel),
-                    2 => self.tile::<2>(first, panel),
-                    3 => self.tile::<3>(first, panel),
-                    4 => self.tile::<4>(first, panel),
-                    5 => self.tile::<5>(first, panel),
-                    6 => self.tile::<6>(first, panel),
-                    other => unreachable!("a tile has 1 to {TILE} rows, got {other}"),
-                }
+        for tile in 0..tiles {
+            let part = even_part(rows.len(), tiles, tile);
+            let first = rows.start + part.start;
+            match part.len() {
+                1 => self.tile::<1, PANELS>(first, panel),
+                2 => self.tile::<2, PANELS>(first, panel),
+                3 => self.tile::<3, PANELS>(first, panel),
+                4 => self.tile::<4, PANELS>(first, panel),
+                5 => self.tile::<5, PANELS>(first, panel),
+                6 => self.tile::<6, PANELS>(first, panel),
+                other => unreachable!("a tile has 1 to {TILE} rows, got {other}"),
             }
         }
     }
 
     #[inline(always)]
-    fn tile<const ROWS: usize>(&self, first: usize, panel: usize) {
+    fn tile<const ROWS: usize, const PANELS: usize>(&self, first: usize, panel: usize) {
         let inputs = self.weight.inputs;
-        let weights = &self.weight.panels[panel * PANEL * inputs..(panel + 1) * PANEL * inputs];
+        let weights: [&[[f32; PANEL]]; PANELS] = std::array::from_fn(|index| {
+            let start = (panel + index) * PANEL * inputs;
+            self.weight.panels[start..start + PANEL * inputs].as_chunks().0
+        });
         let rows: [&[f32]; ROWS] = std::array::from_fn(|row| {
             &self.rows[(first + row) * inputs..(first + row + 1) * inputs]
         });
-        let mut sums = [[0.0f32; PANEL]; ROWS];
-        for (input, weights) in weights.chunks_exact(PANEL).enumerate() {
+        let mut sums = [[[0.0f32; PANEL]; PANELS]; ROWS];
+        for input in 0..inputs {
             for row in 0..ROWS {
-                // SAFETY: a row has as many inputs as the panel has chunks.
+                // SAFETY: a row has `inputs` numbers.
                 let value = unsafe { *rows[row].get_unchecked(input) };
-                for column in 0..PANEL {
-                    sums[row][column] = value.mul_add(weights[column], sums[row][column]);
+                for panel in 0..PANELS {
+                    // SAFETY: a panel has `inputs` chunks.
+                    let weights = unsafe { weights[panel].get_unchecked(input) };
+                    for column in 0..PANEL {
+                        let sum = &mut sums[row][panel][column];
+                        *sum = value.mul_add(weights[column], *sum);
+                    }
                 }
             }
         }
         for (row, sums) in sums.iter().enumerate() {
-            self.store(first + row, panel, sums);
+            for (index, sums) in sums.iter().enumerate() {
+                self.store(first + row, panel + index, sums);
+            }
         }
     }
 
@@ -172,9 +195,25 @@ impl Product<'_> {
     }
 }
 
+fn multiply_rectangle(product: &Product<'_>, rows: Range<usize>, panels: Range<usize>) {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        // SAFETY: the feature was detected on this processor.
+        return unsafe { multiply_rectangle_wide(product, rows, panels) };
+    }
+    multiply_rectangle_fast(product, rows, panels);
+}
+
+/// Twice as fast as with vectors of eight where 512-bit units are whole (measured on Zen 5).
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,fma")]
+fn multiply_rectangle_wide(product: &Product<'_>, rows: Range<usize>, panels: Range<usize>) {
+    product.rectangle::<WIDE_PANELS>(rows, panels);
+}
+
 vectorised! {
-    fn multiply_rectangle(product: &Product<'_>, rows: Range<usize>, panels: Range<usize>)
-        = Product::rectangle;
+    fn multiply_rectangle_fast(product: &Product<'_>, rows: Range<usize>, panels: Range<usize>)
+        = Product::rectangle::<1>;
 }
 
 /// The `index`th of `parts` nearly equal parts of `0..length`.
