@@ -10,7 +10,8 @@ use agent::suite::TASKS;
 use serde_json::Value;
 
 use crate::evaluation::{Evaluation, WAIT, is_alive, kill};
-use crate::harness::{rever, succeed, wait_for};
+use crate::harness::{python, rever, run, succeed, text, wait_for};
+use crate::server::{Server, free_endpoint};
 
 /// One episode per task and strategy: the longest task lasts twice as long as the others, so that
 /// some episodes are recorded while others are still in the middle.
@@ -149,6 +150,61 @@ fn the_report_shows_every_episode() {
     for id in evaluation.records().keys() {
         assert!(written.contains(id.as_str()), "{id} is in the report");
     }
+}
+
+#[test]
+fn doctor_finds_everything_that_a_run_needs() {
+    let folder = fresh_folder("doctor");
+    let mut doctor = rever();
+    doctor.current_dir(&folder).args(["doctor", "--json", "findings.json", "--python"]);
+    let said = succeed(doctor.arg(&python().python));
+    assert!(said.contains("ready: try `rever demo`"), "{said}");
+    let json = std::fs::read(folder.join("findings.json")).expect("a file of findings");
+    let findings: Value = serde_json::from_slice(&json).expect("it is JSON");
+    let names = findings.as_array().expect("a list").iter().map(|finding| {
+        assert_eq!(finding["is_ok"], true, "{finding}");
+        finding["name"].as_str().expect("a name")
+    });
+    let expected = ["python", "rendering", "policy", "verifier", "world", "decision"];
+    assert_eq!(names.collect::<Vec<_>>(), expected);
+}
+
+#[test]
+fn doctor_names_what_is_missing_and_fails() {
+    let nobody = free_endpoint();
+    let output = run(rever().args(["doctor", "--connect", &nobody]));
+    let said = text(&output);
+    assert!(!output.status.success(), "{said}");
+    assert!(said.contains("FAULT world") && said.contains("not ready: world"), "{said}");
+}
+
+#[test]
+fn servers_elsewhere_are_reached_through_a_router() {
+    let (undisturbed, _) = undisturbed();
+    let endpoint = free_endpoint();
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    let router = runtime.block_on(open_router(&endpoint));
+    let _servers = [(); 2].map(|()| Server::start(&endpoint, "elsewhere", &[]));
+    let there = ["--fleet=elsewhere", &format!("--connect={endpoint}")];
+    succeed(rever().arg("doctor").args(there));
+    let evaluation =
+        Evaluation::new(&fresh_folder("elsewhere"), &[&ARGUMENTS[..], &there].concat());
+    evaluation.finish();
+    assert_same_episodes(&evaluation, undisturbed);
+    runtime.block_on(async { router.close().await }).expect("the router closes");
+}
+
+/// A zenoh router in this process, as `zenohd` is one in its own.
+async fn open_router(endpoint: &str) -> zenoh::Session {
+    let mut configuration = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", "\"router\"".to_owned()),
+        ("listen/endpoints", format!("[\"{endpoint}\"]")),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ] {
+        configuration.insert_json5(key, &value).expect("a known setting");
+    }
+    zenoh::open(configuration).await.expect("the router listens")
 }
 
 /// Same candidates, same choices, same outcomes; names of the runs and times differ.

@@ -109,68 +109,106 @@ impl Product<'_> {
         }
     }
 
-    /// All tiles of some rows and some panels, `PANELS` panels at a time.
+    /// All tiles of some rows and some panels.
     #[inline(always)]
-    fn rectangle<const PANELS: usize>(&self, rows: Range<usize>, panels: Range<usize>) {
-        let whole = panels.len() / PANELS * PANELS;
-        let (most, rest) = (panels.start..panels.start + whole, panels.start + whole..panels.end);
-        for panel in most.step_by(PANELS) {
-            self.column::<PANELS>(rows.clone(), panel);
-        }
-        for panel in rest {
-            self.column::<1>(rows.clone(), panel);
-        }
-    }
-
-    /// All tiles of some rows and `PANELS` panels.
-    #[inline(always)]
-    fn column<const PANELS: usize>(&self, rows: Range<usize>, panel: usize) {
-        let tiles = rows.len().div_ceil(TILE);
-        for tile in 0..tiles {
-            let part = even_part(rows.len(), tiles, tile);
-            let first = rows.start + part.start;
-            match part.len() {
-                1 => self.tile::<1, PANELS>(first, panel),
-                2 => self.tile::<2, PANELS>(first, panel),
-                3 => self.tile::<3, PANELS>(first, panel),
-                4 => self.tile::<4, PANELS>(first, panel),
-                5 => self.tile::<5, PANELS>(first, panel),
-                6 => self.tile::<6, PANELS>(first, panel),
-                other => unreachable!("a tile has 1 to {TILE} rows, got {other}"),
+    fn rectangle(&self, rows: Range<usize>, panels: Range<usize>) {
+        for panel in panels {
+            for part in tiles(rows.clone()) {
+                match part.len() {
+                    1 => self.tile::<1>(part.start, panel),
+                    2 => self.tile::<2>(part.start, panel),
+                    3 => self.tile::<3>(part.start, panel),
+                    4 => self.tile::<4>(part.start, panel),
+                    5 => self.tile::<5>(part.start, panel),
+                    6 => self.tile::<6>(part.start, panel),
+                    other => unreachable!("a tile has 1 to {TILE} rows, got {other}"),
+                }
             }
         }
     }
 
     #[inline(always)]
-    fn tile<const ROWS: usize, const PANELS: usize>(&self, first: usize, panel: usize) {
+    fn tile<const ROWS: usize>(&self, first: usize, panel: usize) {
         let inputs = self.weight.inputs;
-        let weights: [&[[f32; PANEL]]; PANELS] = std::array::from_fn(|index| {
-            let start = (panel + index) * PANEL * inputs;
-            self.weight.panels[start..start + PANEL * inputs].as_chunks().0
-        });
-        let rows: [&[f32]; ROWS] = std::array::from_fn(|row| {
-            &self.rows[(first + row) * inputs..(first + row + 1) * inputs]
-        });
-        let mut sums = [[[0.0f32; PANEL]; PANELS]; ROWS];
-        for input in 0..inputs {
+        let weights = &self.weight.panels[panel * PANEL * inputs..(panel + 1) * PANEL * inputs];
+        let rows: [&[f32]; ROWS] = std::array::from_fn(|row| self.row(first + row));
+        let mut sums = [[0.0f32; PANEL]; ROWS];
+        for (input, weights) in weights.chunks_exact(PANEL).enumerate() {
             for row in 0..ROWS {
-                // SAFETY: a row has `inputs` numbers.
+                // SAFETY: a row has as many inputs as the panel has chunks.
                 let value = unsafe { *rows[row].get_unchecked(input) };
-                for panel in 0..PANELS {
-                    // SAFETY: a panel has `inputs` chunks.
-                    let weights = unsafe { weights[panel].get_unchecked(input) };
-                    for column in 0..PANEL {
-                        let sum = &mut sums[row][panel][column];
-                        *sum = value.mul_add(weights[column], *sum);
-                    }
+                for column in 0..PANEL {
+                    sums[row][column] = value.mul_add(weights[column], sums[row][column]);
                 }
             }
         }
         for (row, sums) in sums.iter().enumerate() {
-            for (index, sums) in sums.iter().enumerate() {
-                self.store(first + row, panel + index, sums);
+            self.store(first + row, panel, sums);
+        }
+    }
+
+    /// As [`rectangle`](Self::rectangle), two panels at a time.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f")]
+    fn rectangle_wide(&self, rows: Range<usize>, panels: Range<usize>) {
+        let mut panel = panels.start;
+        while panel < panels.end {
+            let count = WIDE_PANELS.min(panels.end - panel);
+            for part in tiles(rows.clone()) {
+                match (part.len(), count) {
+                    (1, 2) => self.tile_wide::<1, 2>(part.start, panel),
+                    (2, 2) => self.tile_wide::<2, 2>(part.start, panel),
+                    (3, 2) => self.tile_wide::<3, 2>(part.start, panel),
+                    (4, 2) => self.tile_wide::<4, 2>(part.start, panel),
+                    (5, 2) => self.tile_wide::<5, 2>(part.start, panel),
+                    (6, 2) => self.tile_wide::<6, 2>(part.start, panel),
+                    // The last of an odd number of panels, row by row: too seldom to matter.
+                    _ => part.for_each(|row| self.tile_wide::<1, 1>(row, panel)),
+                }
+            }
+            panel += count;
+        }
+    }
+
+    /// Written with intrinsics: left to the compiler, some tile sizes become scalar code.
+    #[cfg(target_arch = "x86_64")]
+    #[inline]
+    #[target_feature(enable = "avx512f")]
+    fn tile_wide<const ROWS: usize, const PANELS: usize>(&self, first: usize, panel: usize) {
+        use std::arch::x86_64::{
+            _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps, _mm512_setzero_ps, _mm512_storeu_ps,
+        };
+        let inputs = self.weight.inputs;
+        let weights: [&[f32]; PANELS] = std::array::from_fn(|index| {
+            let start = (panel + index) * PANEL * inputs;
+            &self.weight.panels[start..start + PANEL * inputs]
+        });
+        let rows: [&[f32]; ROWS] = std::array::from_fn(|row| self.row(first + row));
+        let mut sums = [[_mm512_setzero_ps(); PANELS]; ROWS];
+        for input in 0..inputs {
+            for index in 0..PANELS {
+                // SAFETY: a panel has `inputs` chunks of sixteen.
+                let weight = unsafe { _mm512_loadu_ps(weights[index].as_ptr().add(input * PANEL)) };
+                for row in 0..ROWS {
+                    // SAFETY: a row has `inputs` numbers.
+                    let value = _mm512_set1_ps(unsafe { *rows[row].get_unchecked(input) });
+                    sums[row][index] = _mm512_fmadd_ps(value, weight, sums[row][index]);
+                }
             }
         }
+        for (row, sums) in sums.iter().enumerate() {
+            for (index, &sum) in sums.iter().enumerate() {
+                let mut numbers = [0.0f32; PANEL];
+                // SAFETY: sixteen numbers have room there.
+                unsafe { _mm512_storeu_ps(numbers.as_mut_ptr(), sum) };
+                self.store(first + row, panel + index, &numbers);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn row(&self, row: usize) -> &[f32] {
+        &self.rows[row * self.weight.inputs..(row + 1) * self.weight.inputs]
     }
 
     #[inline(always)]
@@ -199,21 +237,24 @@ fn multiply_rectangle(product: &Product<'_>, rows: Range<usize>, panels: Range<u
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx512f") {
         // SAFETY: the feature was detected on this processor.
-        return unsafe { multiply_rectangle_wide(product, rows, panels) };
+        return unsafe { product.rectangle_wide(rows, panels) };
     }
     multiply_rectangle_fast(product, rows, panels);
 }
 
-/// Twice as fast as with vectors of eight where 512-bit units are whole (measured on Zen 5).
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,fma")]
-fn multiply_rectangle_wide(product: &Product<'_>, rows: Range<usize>, panels: Range<usize>) {
-    product.rectangle::<WIDE_PANELS>(rows, panels);
-}
-
 vectorised! {
     fn multiply_rectangle_fast(product: &Product<'_>, rows: Range<usize>, panels: Range<usize>)
-        = Product::rectangle::<1>;
+        = Product::rectangle;
+}
+
+/// Rows in nearly equal parts of at most [`TILE`].
+#[inline(always)]
+fn tiles(rows: Range<usize>) -> impl Iterator<Item = Range<usize>> {
+    let count = rows.len().div_ceil(TILE);
+    (0..count).map(move |index| {
+        let part = even_part(rows.len(), count, index);
+        rows.start + part.start..rows.start + part.end
+    })
 }
 
 /// The `index`th of `parts` nearly equal parts of `0..length`.
