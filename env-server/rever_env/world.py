@@ -35,8 +35,8 @@ __all__ = [
 ]
 
 _START_GAP = 0.002  # objects start this far above rest, metres
-# m/s or rad/s: beyond this the physics is broken, not fast. What falls off the table lands on an edge
-# and spins at more than 100 rad/s.
+# m/s or rad/s: beyond this the physics is broken, not fast. What falls off the table lands on an
+# edge and spins at more than 100 rad/s.
 _SPEED_MAX = 1000.0
 # Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
 _DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
