@@ -25,10 +25,19 @@ impl Server {
     /// Starts a server that connects to `connect`, and waits until it says that it is ready.
     pub fn start(connect: &str, fleet: &str, arguments: &[&str]) -> Self {
         let endpoint = free_endpoint();
+        Self::start_with(connect, fleet, &[&["--listen", &endpoint], arguments].concat(), &endpoint)
+    }
+
+    /// The same, listening nowhere: for a router that `connect` names.
+    pub fn start_behind_router(connect: &str, fleet: &str) -> Self {
+        Self::start_with(connect, fleet, &[], connect)
+    }
+
+    fn start_with(connect: &str, fleet: &str, arguments: &[&str], endpoint: &str) -> Self {
         let mut command = python().command();
         command
             .args(["-m", "rever_env", "serve", "--exit-with-parent", "--connect", connect])
-            .args(["--listen", &endpoint, "--fleet", fleet])
+            .args(["--fleet", fleet])
             .args(arguments)
             .stdin(Stdio::null())
             .stdout(Stdio::piped());
@@ -39,7 +48,7 @@ impl Server {
         let id = line.strip_prefix("ready ").map(|id| id.trim_end().to_owned());
         let id =
             id.unwrap_or_else(|| panic!("expected a line `ready` of the server, got {line:?}"));
-        Self { child, id, endpoint }
+        Self { child, id, endpoint: endpoint.to_owned() }
     }
 
     /// As a crash would: nothing is cleaned up.

@@ -184,7 +184,7 @@ fn servers_elsewhere_are_reached_through_a_router() {
     let endpoint = free_endpoint();
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     let router = runtime.block_on(open_router(&endpoint));
-    let _servers = [(); 2].map(|()| Server::start(&endpoint, "elsewhere", &[]));
+    let _servers = [(); 2].map(|()| Server::start_behind_router(&endpoint, "elsewhere"));
     let there = ["--fleet=elsewhere", &format!("--connect={endpoint}")];
     succeed(rever().arg("doctor").args(there));
     let evaluation =

@@ -14,6 +14,8 @@ from rever_env.protocol import limits
 _FINISH_SECS_MAX = 10.0  # a wedged simulation is given up after that
 _PARENT_POLL_SECS = 0.5
 _CONGESTION_MICROSECONDS = 60_000_000  # a slow reader holds a reply up; it does not cost the link
+# A client waits this long for the router or agent that it is told to connect to.
+_CLIENT_WAIT_MILLISECONDS = 30_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,10 +60,16 @@ class Endpoints:
         # Left out, this is a free port on every interface: what others find by multicast.
         by_multicast = self.multicast and not self.listen
         listen = {} if by_multicast else {"listen": {"endpoints": self.listen}}
+        # A router forwards between its clients, not between its peers, which it takes for linked.
+        # And whoever has one way out and no way in needs no more than a client does.
+        is_client = len(self.connect) == 1 and not self.listen and not self.multicast
         return json.dumps(
             {
-                "mode": "peer",
-                "connect": {"endpoints": self.connect},
+                "mode": "client" if is_client else "peer",
+                "connect": {
+                    "endpoints": self.connect,
+                    "timeout_ms": {"client": _CLIENT_WAIT_MILLISECONDS},
+                },
                 **listen,
                 "scouting": {
                     "multicast": {"enabled": self.multicast},

@@ -270,3 +270,13 @@ def test_nothing_listens_but_what_is_named() -> None:
     assert not configuration["scouting"]["multicast"]["enabled"]
     assert not configuration["scouting"]["gossip"]["enabled"]
     assert "listen" not in json.loads(Endpoints((), (), True).configuration())
+
+
+def test_only_one_way_out_and_no_way_in_makes_a_client() -> None:
+    def mode(connect: tuple[str, ...], listen: tuple[str, ...]) -> object:
+        return json.loads(Endpoints(connect, listen, False).configuration())["mode"]
+
+    first, second = "tcp/127.0.0.1:1", "tcp/127.0.0.1:2"
+    assert mode((first,), ()) == "client"
+    assert mode((first, second), ()) == "peer"
+    assert mode((first,), (second,)) == "peer"

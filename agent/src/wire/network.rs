@@ -16,6 +16,8 @@ const ANY_LOOPBACK_PORT: &str = "tcp/127.0.0.1:0";
 const PORT_ATTEMPTS_MAX: usize = 10;
 /// A slow reader holds a message up that long before the link is given up.
 const CONGESTION_MICROSECONDS: u64 = 60_000_000;
+/// A client waits this long for the router or server that it is told to connect to.
+const CLIENT_WAIT_MS: u32 = 30_000;
 
 /// Where the network lies. Nothing is opened that is not named here.
 #[derive(Debug, Clone)]
@@ -137,8 +139,12 @@ fn with_ports(endpoints: &[String]) -> anyhow::Result<Vec<String>> {
 
 fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Result<zenoh::Config> {
     let rx_bytes_max = limits::MESSAGE_BYTES_MAX + 65_536;
+    // A router forwards between its clients, not between its peers, which it takes for linked. And
+    // whoever has one way out and no way in needs no more than a client does.
+    let is_client = options.connect.len() == 1 && listening.is_empty() && !options.multicast;
     let entries = [
-        ("mode", "\"peer\"".to_owned()),
+        ("mode", if is_client { "\"client\"" } else { "\"peer\"" }.to_owned()),
+        ("connect/timeout_ms", format!("{{\"client\": {CLIENT_WAIT_MS}}}")),
         ("connect/endpoints", serde_json::to_string(&options.connect)?),
         ("listen/endpoints", serde_json::to_string(listening)?),
         ("scouting/multicast/enabled", options.multicast.to_string()),
