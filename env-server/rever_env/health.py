@@ -3,6 +3,7 @@
 import argparse
 import sys
 import time
+from pathlib import Path
 
 _ASK_SECS = 2.0  # one query; a link that has just been opened may not lead anywhere yet
 
@@ -12,6 +13,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--connect", required=True, metavar="ENDPOINT", help="tcp/127.0.0.1:7448")
     parser.add_argument("--fleet", default="local", help="who meets whom (default: local)")
     parser.add_argument("--timeout-secs", type=float, default=5.0, help="(default: 5)")
+    parser.add_argument(
+        "--id-file", type=Path, help="ask only the server that was started with this --id-file"
+    )
     parser.set_defaults(run=health)
 
 
@@ -22,11 +26,18 @@ def health(arguments: argparse.Namespace) -> int:
     from rever_env import protocol
     from rever_env.serving import Endpoints
 
-    endpoints = Endpoints(connect=(arguments.connect,), listen=(), multicast=False)
-    key = protocol.Keys(arguments.fleet).describe_all()
-    deadline = time.monotonic() + arguments.timeout_secs
+    seconds = arguments.timeout_secs
+    endpoints = Endpoints((arguments.connect,), (), multicast=False, wait_secs=seconds)
+    keys = protocol.Keys(arguments.fleet)
+    deadline = time.monotonic() + seconds
     found = 0
-    with zenoh.open(zenoh.Config.from_json5(endpoints.configuration())) as network:
+    try:
+        one = arguments.id_file and arguments.id_file.read_text(encoding="utf-8")
+        network = zenoh.open(zenoh.Config.from_json5(endpoints.configuration()))
+    except (OSError, zenoh.ZError) as error:
+        return _nobody(arguments, f": {error}")
+    key = keys.describe(one) if one else keys.describe_all()
+    with network:
         while not found and time.monotonic() < deadline:
             for reply in network.get(key, timeout=_ASK_SECS):
                 if reply.ok is None:
@@ -36,10 +47,13 @@ def health(arguments: argparse.Namespace) -> int:
                     f"{server.server}: {server.sessions} of {server.sessions_max} sessions in use"
                 )
                 found += 1
-    if not found:
-        print(
-            f"error: no server of fleet {arguments.fleet} answered at {arguments.connect} "
-            f"within {arguments.timeout_secs:g} s",
-            file=sys.stderr,
-        )
-    return 0 if found else 1
+    return 0 if found else _nobody(arguments, "")
+
+
+def _nobody(arguments: argparse.Namespace, why: str) -> int:
+    print(
+        f"error: no server of fleet {arguments.fleet} answered at {arguments.connect} "
+        f"within {arguments.timeout_secs:g} s{why}",
+        file=sys.stderr,
+    )
+    return 1

@@ -8,14 +8,13 @@ import signal
 import sys
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 
 from rever_env.protocol import limits
 
 _FINISH_SECS_MAX = 10.0  # a wedged simulation is given up after that
 _PARENT_POLL_SECS = 0.5
 _CONGESTION_MICROSECONDS = 60_000_000  # a slow reader holds a reply up; it does not cost the link
-# A client waits this long for the router or agent that it is told to connect to.
-_CLIENT_WAIT_MILLISECONDS = 30_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PID",
         help="end when this parent process (default: the one that started it) is gone",
     )
+    parser.add_argument(
+        "--id-file", type=Path, help="write the server's id there when it is ready, for health"
+    )
     parser.set_defaults(run=serve)
 
 
@@ -52,6 +54,8 @@ class Endpoints:
     connect: tuple[str, ...]
     listen: tuple[str, ...]
     multicast: bool
+    # How long a client waits for the router or agent that it is told to connect to.
+    wait_secs: float = 30.0
 
     def configuration(self) -> str:
         """zenoh's configuration in JSON."""
@@ -68,7 +72,7 @@ class Endpoints:
                 "mode": "client" if is_client else "peer",
                 "connect": {
                     "endpoints": self.connect,
-                    "timeout_ms": {"client": _CLIENT_WAIT_MILLISECONDS},
+                    "timeout_ms": {"client": round(1000 * self.wait_secs)},
                 },
                 **listen,
                 "scouting": {
@@ -101,12 +105,22 @@ def serve(arguments: argparse.Namespace) -> int:
         signal.signal(number, lambda *_: stop.set())
     options = ServerOptions(arguments.fleet, arguments.sessions, arguments.idle_secs)
     failures: list[BaseException] = []
-    with zenoh.open(zenoh.Config.from_json5(endpoints.configuration())) as network:
+    try:
+        network = zenoh.open(zenoh.Config.from_json5(endpoints.configuration()))
+    except zenoh.ZError as error:
+        print(f"error: cannot open the network: {error}", file=sys.stderr)
+        return 1
+    with network:
         server = Server(network, Worlds(tasks.load(), options.sessions_max), options)
+
+        def ready(name: str) -> None:
+            if arguments.id_file:
+                arguments.id_file.write_text(name, encoding="utf-8")
+            print(f"ready {name}", flush=True)
 
         def simulate() -> None:
             try:
-                server.run(stop, lambda name: print(f"ready {name}", flush=True))
+                server.run(stop, ready)
             except BaseException as error:
                 logging.exception("the simulation thread failed")
                 failures.append(error)

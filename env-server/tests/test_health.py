@@ -6,18 +6,19 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 
 @pytest.fixture
-def served() -> Iterator[tuple[subprocess.Popen[str], str]]:
+def served(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     command = [sys.executable, "-m", "rever_env", "serve", "--exit-with-parent"]
     server = subprocess.Popen(
-        [*command, "--listen", endpoint],
+        [*command, "--listen", endpoint, "--id-file", str(tmp_path / "id")],
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
@@ -27,10 +28,10 @@ def served() -> Iterator[tuple[subprocess.Popen[str], str]]:
     server.communicate()
 
 
-def health(endpoint: str, timeout_secs: str) -> subprocess.CompletedProcess[str]:
+def health(endpoint: str, timeout_secs: str, *more: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "rever_env", "health", "--connect", endpoint]
     return subprocess.run(
-        [*command, "--timeout-secs", timeout_secs],
+        [*command, "--timeout-secs", timeout_secs, *more],
         capture_output=True,
         text=True,
         timeout=120,
@@ -38,13 +39,20 @@ def health(endpoint: str, timeout_secs: str) -> subprocess.CompletedProcess[str]
     )
 
 
-def test_only_a_server_that_works_is_healthy(served: tuple[subprocess.Popen[str], str]) -> None:
+def test_only_a_server_that_works_is_healthy(
+    served: tuple[subprocess.Popen[str], str], tmp_path: Path
+) -> None:
     server, endpoint = served
     assert server.stdout is not None
     name = server.stdout.readline().removeprefix("ready ").strip()
     working = health(endpoint, "60")
     assert (working.returncode, working.stderr) == (0, "")
     assert working.stdout == f"{name}: 0 of 16 sessions in use\n"
+
+    assert health(endpoint, "60", "--id-file", str(tmp_path / "id")).stdout == working.stdout
+    (tmp_path / "other").write_text("another")
+    other = health(endpoint, "0.5", "--id-file", str(tmp_path / "other"))
+    assert (other.returncode, other.stdout) == (1, "")
 
     server.send_signal(signal.SIGSTOP)
     stopped = health(endpoint, "0.5")
