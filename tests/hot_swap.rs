@@ -69,6 +69,7 @@ fn verifier(policy: &Policy, seed: u64) -> Verifier {
             hidden: (0..size).map(value).collect(),
             steps: vec![0],
             steps_total: 1,
+            decisions: None,
         }
     });
     let set = TrainingSet::new(size, episodes).expect("a training set");

@@ -218,7 +218,7 @@ fn agree(a: &CandidateAction, b: &CandidateAction) -> bool {
 /// The mean distance to the other well-formed candidates; 0 when there is none.
 ///
 /// Ranking by the mean is ranking by the sum, and the mean keeps its meaning when some candidates are malformed.
-fn distance_mean(
+pub(crate) fn distance_mean(
     candidates: &[Option<CandidateAction>],
     index: usize,
     own: &CandidateAction,

@@ -15,14 +15,14 @@ use crate::suite::{Arm, Placements, SeedRange, Suite};
 pub struct Arguments {
     #[command(flatten)]
     episodes_arguments: EpisodesArguments,
-    /// How candidates are chosen: one sample, unless more than one is proposed.
+    /// How candidates are chosen; `sample` executes the first, and the others show what it was drawn beside.
     #[arg(long, default_value = "sample")]
     strategy: Strategy,
     /// Episodes of each task.
     #[arg(long, default_value_t = 100)]
     episodes: u32,
-    /// Candidates per step, for strategies that choose.
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    /// Candidates per step; with one, a verifier cannot learn to choose.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=256))]
     candidates: u32,
     /// Sampling temperature.
     #[arg(long, default_value_t = 1.0, value_parser = temperature)]
@@ -41,8 +41,15 @@ pub fn run(arguments: Arguments) -> Result<()> {
         range: SeedRange::Collection,
         seed: arguments.episodes_arguments.seed,
     };
-    let arm = Arm::new(arguments.strategy, arguments.candidates, arguments.temperature);
-    let campaign = arguments.episodes_arguments.campaign("collect", suite, vec![arm])?;
+    let Arguments { strategy, candidates, temperature, .. } = arguments;
+    let arm = match strategy {
+        // In an evaluation the siblings of a sample would be a waste of time; here they teach.
+        Strategy::Sample => Arm { strategy, candidates, temperature },
+        _ => Arm::new(strategy, candidates, temperature),
+    };
+    let mut episodes_arguments = arguments.episodes_arguments;
+    episodes_arguments.all_hidden |= strategy == Strategy::Sample;
+    let campaign = episodes_arguments.campaign("collect", suite, vec![arm])?;
     let report = campaign.run()?;
     println!("labels: {}", campaign.labels.display());
     show(&report, arguments.json.as_deref())

@@ -11,8 +11,9 @@ use serde::Serialize;
 use crate::policy::Policy;
 use crate::record::write_whole;
 use crate::table::aligned;
-use crate::training::{Epoch, LabelledEpisode, TrainingSet, records, train};
-use crate::verifier::{Description, Discrimination, Metrics, Options, Verifier};
+use crate::training::records::{self, Reader};
+use crate::training::{Epoch, LabelledEpisode, TrainingSet, train};
+use crate::verifier::{Description, Discrimination, Gain, Metrics, Options, Verifier};
 use crate::wire::{Network, NetworkOptions, VerifierPublisher};
 
 /// How long to look for agents that follow the verifier before it is published to nobody yet.
@@ -50,6 +51,9 @@ pub struct Arguments {
     /// Share of the episodes of every task that is held out
     #[arg(long, default_value_t = Options::default().held_out_share)]
     held_out_share: f64,
+    /// Leave out the part that compares candidates: the paper's verifier
+    #[arg(long)]
+    plain: bool,
     /// Also write the figures to this file
     #[arg(long)]
     json: Option<PathBuf>,
@@ -87,7 +91,9 @@ struct ResultFile<'a> {
 pub fn run(arguments: Arguments) -> Result<()> {
     let started = Instant::now();
     let policy = Policy::load(&arguments.policy)?;
-    let (episodes, set_aside) = read(&arguments, policy.digest())?;
+    let action_scale = policy.action_scale();
+    let reader = Reader { policy: policy.digest(), action_scale: &action_scale };
+    let (episodes, set_aside) = read(&arguments, reader)?;
     ensure!(
         !episodes.is_empty(),
         "training: expected episodes, got none; set aside: {}",
@@ -120,12 +126,12 @@ pub fn run(arguments: Arguments) -> Result<()> {
 
 fn read(
     arguments: &Arguments,
-    policy: &str,
+    reader: Reader<'_>,
 ) -> Result<(Vec<LabelledEpisode>, BTreeMap<&'static str, usize>)> {
     if arguments.runs.is_empty() {
-        return records::from_labels(&arguments.labels, policy);
+        return records::from_labels(&arguments.labels, reader);
     }
-    Ok((records::from_runs(&arguments.runs, policy)?, BTreeMap::new()))
+    Ok((records::from_runs(&arguments.runs, reader)?, BTreeMap::new()))
 }
 
 fn options(arguments: &Arguments) -> Result<Options> {
@@ -137,6 +143,7 @@ fn options(arguments: &Arguments) -> Result<Options> {
         learning_rate: arguments.learning_rate,
         weight_decay: arguments.weight_decay,
         held_out_share: arguments.held_out_share,
+        choice: !arguments.plain,
         ..Options::default()
     })
 }
@@ -203,6 +210,22 @@ fn table(verifier: &Verifier) -> String {
         figure(held_out.brier_score),
         figure(held_out.calibration_error),
         held_out.reliability.len(),
+    ) + &choice_text(verifier)
+}
+
+/// What the choice part is worth beside the medoid, by decisions taken one at a time.
+fn choice_text(verifier: &Verifier) -> String {
+    let Some(choice) = &verifier.description().choice else {
+        return "no choice part: it takes `rever collect --candidates 5` and no --plain\n"
+            .to_owned();
+    };
+    let gain = |gain: &Gain| format!("{:+.1} ± {:.1}", gain.points, gain.standard_error);
+    format!(
+        "choosing, from {} episodes ({} decisions): changing one decision at a time would bring {} points in sum, the medoid {} (cross-fitted, ± one standard error)\n",
+        choice.episodes,
+        choice.decisions,
+        gain(&choice.gain),
+        gain(&choice.medoid_gain),
     )
 }
 
@@ -258,6 +281,7 @@ mod tests {
                 .collect(),
             steps: (0..40).collect(),
             steps_total: 40,
+            decisions: None,
         };
         let set = TrainingSet::new(1, (0..30).map(episode)).expect("a whole set");
         let options = Options {

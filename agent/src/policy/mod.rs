@@ -43,6 +43,7 @@ mod segment;
 mod actions;
 mod candidate;
 mod generation;
+mod lanes;
 mod prompt;
 mod reasoning;
 mod sampling;
@@ -59,7 +60,8 @@ pub use timings::Timings;
 use actions::ActionBins;
 use config::{ACTION_LENGTH, Config};
 use decoder::Wanted;
-use generation::{Continuation, Limits, complete};
+use generation::{Continuation, Limits};
+use lanes::Lanes;
 use network::{Context, Network};
 use prompt::Prompter;
 use trace::Trace;
@@ -70,6 +72,7 @@ pub struct Policy {
     network: Network,
     prompter: Prompter,
     bins: ActionBins,
+    lanes: Lanes,
     digest: String,
 }
 
@@ -89,7 +92,8 @@ impl Policy {
             let bins = ActionBins::new(config.vocabulary, config.action_bins, scale);
             let digest = digest(directory)?;
             tracing::debug!(dead_weights = network.dead_weights, digest, "policy loaded");
-            Ok(Policy { config, network, prompter, bins, digest })
+            let lanes = Lanes::new(backend)?;
+            Ok(Policy { config, network, prompter, bins, lanes, digest })
         };
         load().with_context(|| format!("cannot load the policy in {}", directory.display()))
     }
@@ -147,7 +151,7 @@ impl Policy {
             vocabulary: self.config.vocabulary,
             end: self.config.text.eos_token_id,
         };
-        let completions = complete(&self.network, &sessions, &limits)?;
+        let completions = self.lanes.complete(&self.network, &sessions, &limits)?;
         let mut proposals: Vec<Proposal> =
             requests.iter().map(|_| Proposal { candidates: Vec::new() }).collect();
         for completion in completions {

@@ -13,7 +13,7 @@ use crate::record::{
 };
 use crate::strategy::{CandidateAction, Decision};
 use crate::suite::step_seed;
-use crate::verifier::{Verifier, probability};
+use crate::verifier::{Siblings, Verifier, probability};
 use crate::video::Video;
 use crate::wire::Episode;
 
@@ -98,9 +98,16 @@ impl Attempt {
     }
 
     /// The verifier's logits of the candidates.
-    pub fn score(&self, proposal: &Proposal) -> Option<Vec<f32>> {
+    pub fn score(&self, proposal: &Proposal, action_scale: &[f32; 7]) -> Option<Vec<f32>> {
+        let verifier = self.verifier.as_ref()?;
         let hidden: Vec<&[f32]> = proposal.candidates.iter().map(|one| &*one.hidden).collect();
-        self.verifier.as_ref().map(|verifier| verifier.logits(&hidden))
+        let actions: Vec<_> = proposal.candidates.iter().map(candidate_action).collect();
+        Some(verifier.logits(&Siblings {
+            hidden: &hidden,
+            actions: &actions,
+            instruction: &self.instruction,
+            action_scale,
+        }))
     }
 
     /// Chooses a candidate, notes the step, and says what to do.

@@ -75,7 +75,7 @@ impl Rollout<'_> {
             }
             let begun = Instant::now();
             let proposals = self.propose(&attempts)?;
-            let logits = score(&attempts, &proposals);
+            let logits = self.score(&attempts, &proposals);
             let actions = self.choose(&mut attempts, proposals, logits);
             let decision_ms = milliseconds_since(begun);
             attempts = self.step(attempts, actions, decision_ms).await?;
@@ -113,6 +113,12 @@ impl Rollout<'_> {
         let requests: Vec<ProposalRequest<'_>> = attempts.iter().map(Attempt::request).collect();
         // The network computes on all cores; the runtime's other tasks go on meanwhile.
         block_in_place(|| self.policy.propose(&requests))
+    }
+
+    fn score(&self, attempts: &[Attempt], proposals: &[Proposal]) -> Vec<Option<Vec<f32>>> {
+        let scale = self.policy.action_scale();
+        let decisions = attempts.iter().zip(proposals);
+        decisions.map(|(attempt, proposal)| attempt.score(proposal, &scale)).collect()
     }
 
     fn choose(
@@ -191,10 +197,6 @@ impl Rollout<'_> {
             Err(error) => tracing::warn!("the verifier {} is ignored: {error:#}", update.name),
         }
     }
-}
-
-fn score(attempts: &[Attempt], proposals: &[Proposal]) -> Vec<Option<Vec<f32>>> {
-    attempts.iter().zip(proposals).map(|(attempt, proposal)| attempt.score(proposal)).collect()
 }
 
 fn reset(identity: &EpisodeIdentity) -> Reset {

@@ -1,5 +1,12 @@
 //! Trains a verifier on finished episodes: every step of a success is a positive, every step of a failure a negative.
+//!
+//! ```text
+//! hidden states, outcomes ─▶ network, by equation 4: how promising a situation is
+//! siblings of drawn candidates ─▶ critic ─▶ advantages ─▶ choice: which candidate is better
+//! ```
 
+mod advantage;
+mod choice;
 mod learner;
 pub mod records;
 mod set;
@@ -10,7 +17,7 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 
-pub use set::{LabelledEpisode, Split, TrainingSet};
+pub use set::{DecisionSample, Decisions, LabelledEpisode, STATISTICS, Split, TrainingSet};
 
 use crate::verifier::{
     Description, Evidence, HeldOut, Metrics, Network, Options, Standardisation, Verifier,
@@ -89,19 +96,22 @@ pub fn train(
     }
     let (epochs, _, network) = best.context("no epoch was run")?;
     let held_out = Metrics::measure(&score(set, &split.held_out, &network), positive_share);
+    let choice = if options.choice { choice::fit(set, options)? } else { None };
+    let (choice, choice_evidence) = choice.unzip();
     let description = Description {
         policy: policy.to_owned(),
         input_size: set.input_size(),
         options: options.clone(),
         evidence: Evidence { epochs, ..evidence },
         held_out,
+        choice: choice_evidence,
     };
-    Verifier::new(&network, &description)
+    Verifier::new(&network, choice.as_ref(), &description)
 }
 
 fn check(options: &Options) -> anyhow::Result<()> {
-    let Options { hidden_sizes, epochs_max, batch_samples, learning_rate, held_out_share, .. } =
-        options;
+    let Options { hidden_sizes, epochs_max, batch_samples, learning_rate, .. } = options;
+    let Options { held_out_share, advantage_decay, choice_ridge, .. } = options;
     ensure!(
         hidden_sizes.iter().all(|size| (1..=4096).contains(size)),
         "hidden sizes: expected 1 to 4096, got {hidden_sizes:?}"
@@ -115,6 +125,14 @@ fn check(options: &Options) -> anyhow::Result<()> {
     ensure!(
         *held_out_share > 0.0 && *held_out_share < 1.0,
         "held-out share: expected between 0 and 1, got {held_out_share}"
+    );
+    ensure!(
+        (0.0..=1.0).contains(advantage_decay),
+        "advantage decay: expected 0 to 1, got {advantage_decay}"
+    );
+    ensure!(
+        choice_ridge.is_finite() && *choice_ridge > 0.0,
+        "choice ridge: expected more than 0, got {choice_ridge}"
     );
     Ok(())
 }
@@ -181,6 +199,7 @@ fn score(set: &TrainingSet, episodes: &[usize], network: &Network) -> HeldOut {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::verifier::Siblings;
     use rand::Rng;
 
     /// Episodes of two tasks whose success shows, noisily, in the second of four features; the rest is noise.
@@ -205,6 +224,7 @@ mod tests {
                 hidden,
                 steps,
                 steps_total: 30,
+                decisions: None,
             }
         };
         (0..episodes).map(&mut episode).collect()
@@ -235,7 +255,12 @@ mod tests {
         assert!(held_out.loss.expect("samples") < 0.5, "{held_out:?}");
         assert_eq!(held_out.auroc.tasks.len(), 2);
         // And the sign is right: more of the second feature is better.
-        let logits = verifier.logits(&[&[5.0, 9.0, 5.0, 5.0], &[5.0, 1.0, 5.0, 5.0]]);
+        let logits = verifier.logits(&Siblings {
+            hidden: &[&[5.0, 9.0, 5.0, 5.0], &[5.0, 1.0, 5.0, 5.0]],
+            actions: &[None, None],
+            instruction: "",
+            action_scale: &[1.0; 7],
+        });
         assert!(logits[0] > 1.0 && logits[1] < -1.0, "{logits:?}");
     }
 

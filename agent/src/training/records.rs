@@ -5,14 +5,24 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
-use protocol::EpisodeOutcome;
+use protocol::{EpisodeOutcome, Statistics};
 
-use super::LabelledEpisode;
+use super::{DecisionSample, Decisions, LabelledEpisode, STATISTICS};
 use crate::labels::{LabelStore, outcome};
-use crate::record::{EpisodeRecord, hidden_from_bytes};
+use crate::record::{CandidateRecord, EpisodeRecord, StepRecord, hidden_from_bytes};
 use crate::run::{record_path, recorded};
-use crate::strategy::Strategy;
+use crate::strategy::{CandidateAction, Strategy};
 use crate::suite::SeedRange;
+use crate::verifier::{DEVIATIONS, Features, features, mean_hidden};
+
+/// What records are read for.
+#[derive(Clone, Copy, Debug)]
+pub struct Reader<'a> {
+    /// Digest of the policy whose verifier is trained.
+    pub policy: &'a str,
+    /// One unit of each number of its actions.
+    pub action_scale: &'a [f32; DEVIATIONS],
+}
 
 /// Why an episode must not teach the verifier of a policy.
 #[derive(Clone, Debug, PartialEq)]
@@ -105,14 +115,14 @@ pub fn object(outcome: &EpisodeOutcome, policy: &str) -> Option<Objection> {
 /// All episodes of the given runs; refuses, naming the record, when one of them must not teach.
 ///
 /// A run was named by hand: leaving a part of it out in silence would hide a mistake.
-pub fn from_runs(folders: &[PathBuf], policy: &str) -> anyhow::Result<Vec<LabelledEpisode>> {
+pub fn from_runs(folders: &[PathBuf], reader: Reader<'_>) -> anyhow::Result<Vec<LabelledEpisode>> {
     let mut episodes = Vec::new();
     for folder in folders {
         for id in recorded(folder)? {
             let path = record_path(folder, &id);
             let record = EpisodeRecord::read(&path)?;
             episodes.push(
-                labelled(&record, policy).with_context(|| format!("record {}", path.display()))?,
+                labelled(&record, reader).with_context(|| format!("record {}", path.display()))?,
             );
         }
     }
@@ -124,13 +134,13 @@ pub fn from_runs(folders: &[PathBuf], policy: &str) -> anyhow::Result<Vec<Labell
 /// A store is fed by every run, evaluations included, so most objections are in order here.
 pub fn from_labels(
     path: &Path,
-    policy: &str,
+    reader: Reader<'_>,
 ) -> anyhow::Result<(Vec<LabelledEpisode>, BTreeMap<&'static str, usize>)> {
     // Opening would make an empty store.
     ensure!(path.is_file(), "label store {}: expected a file, got none", path.display());
     let (mut episodes, mut set_aside) = (Vec::new(), BTreeMap::new());
     for label in LabelStore::open(path)?.labels()? {
-        let reason = match (object(&label.outcome, policy), label.record) {
+        let reason = match (object(&label.outcome, reader.policy), label.record) {
             (Some(objection), _) => objection.reason(),
             (None, None) => "record on another machine",
             (None, Some(path)) => {
@@ -141,7 +151,7 @@ pub fn from_labels(
                     "record {}: expected the episode of its label, got another",
                     path.display()
                 );
-                let episode = labelled(&record, policy);
+                let episode = labelled(&record, reader);
                 episodes.push(episode.with_context(|| format!("record {}", path.display()))?);
                 continue;
             }
@@ -152,12 +162,17 @@ pub fn from_labels(
 }
 
 /// The record as training samples; refuses what must not teach.
-pub fn labelled(record: &EpisodeRecord, policy: &str) -> anyhow::Result<LabelledEpisode> {
-    if let Some(objection) = object(&outcome(record), policy) {
+pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<LabelledEpisode> {
+    if let Some(objection) = object(&outcome(record), reader.policy) {
         bail!(objection);
     }
     let (mut hidden, mut steps) = (Vec::new(), Vec::new());
+    // A chosen candidate would make a good choice look like a good candidate.
+    let is_drawn = record.identity.strategy == Strategy::Sample.name();
+    let mut decisions = (is_drawn && record.identity.candidates > 1).then(Vec::new);
+    let mut statistics = Statistics::default();
     for (index, step) in record.steps.iter().enumerate() {
+        let before = std::mem::replace(&mut statistics, step.statistics);
         // The robot held still: nothing that the policy said was executed.
         let Some(chosen) = step.chosen else { continue };
         let candidate = step.candidates.get(chosen as usize);
@@ -167,7 +182,14 @@ pub fn labelled(record: &EpisodeRecord, policy: &str) -> anyhow::Result<Labelled
         })?;
         hidden.extend(hidden_from_bytes(bytes).with_context(|| format!("step {index}"))?);
         steps.push(index);
+        if let Some(list) = &mut decisions {
+            match decision(step, before, reader).with_context(|| format!("step {index}"))? {
+                Some(sample) => list.push(sample),
+                None => decisions = None,
+            }
+        }
     }
+    let instruction = record.instruction.clone();
     Ok(LabelledEpisode {
         name: format!("{}/{}", record.identity.run, record.identity.id()),
         task: record.identity.task.clone(),
@@ -175,7 +197,74 @@ pub fn labelled(record: &EpisodeRecord, policy: &str) -> anyhow::Result<Labelled
         hidden,
         steps,
         steps_total: record.steps.len(),
+        decisions: decisions.map(|list| Decisions { instruction, list }),
     })
+}
+
+/// What a step's decision was between; none when hidden states of well-formed candidates were not kept.
+fn decision(
+    step: &StepRecord,
+    before: Statistics,
+    reader: Reader<'_>,
+) -> anyhow::Result<Option<DecisionSample>> {
+    let actions: Vec<_> = step.candidates.iter().map(candidate_action).collect();
+    let well_formed = step.candidates.iter().filter(|candidate| candidate.action.is_some());
+    let Some(bytes) = well_formed.map(|one| one.hidden.as_ref()).collect::<Option<Vec<_>>>() else {
+        return Ok(None);
+    };
+    let rows = bytes.into_iter().map(|bytes| hidden_from_bytes(bytes));
+    let rows = rows.collect::<anyhow::Result<Vec<Vec<f32>>>>()?;
+    let size = rows.first().map_or(0, Vec::len);
+    ensure!(
+        rows.iter().all(|row| row.len() == size),
+        "expected hidden states of one size, got several"
+    );
+    let rows: Vec<&[f32]> = rows.iter().map(Vec::as_slice).collect();
+    let candidates: Vec<Features> =
+        features(&actions, reader.action_scale).into_iter().flatten().collect();
+    ensure!(
+        candidates.len() == rows.len(),
+        "expected seven action tokens of each of {} candidates, got {} with them",
+        rows.len(),
+        candidates.len()
+    );
+    Ok(Some(DecisionSample {
+        hidden_mean: mean_hidden(&rows, size),
+        statistics: flags(before),
+        candidates,
+    }))
+}
+
+/// What the candidate would do; its tokens end with the seven of the action.
+fn candidate_action(candidate: &CandidateRecord) -> Option<CandidateAction> {
+    let tokens = candidate.tokens.last_chunk()?;
+    Some(CandidateAction { tokens: *tokens, action: candidate.action? })
+}
+
+fn flags(statistics: Statistics) -> [f32; STATISTICS] {
+    let Statistics {
+        is_success,
+        is_grasped,
+        ever_grasped,
+        consecutive_grasp,
+        moved_correct_object,
+        moved_wrong_object,
+        source_on_target,
+        ever_success,
+        released_success,
+    } = statistics;
+    let flags = [
+        is_success,
+        is_grasped,
+        ever_grasped,
+        consecutive_grasp,
+        moved_correct_object,
+        moved_wrong_object,
+        source_on_target,
+        ever_success,
+        released_success,
+    ];
+    flags.map(|flag| f32::from(u8::from(flag)))
 }
 
 #[cfg(test)]
@@ -187,10 +276,12 @@ mod tests {
     };
     use protocol::Statistics;
 
+    const CAFE: Reader<'_> = Reader { policy: "cafe", action_scale: &[1.0; 7] };
+
     /// Three steps with two candidates each; the second is executed, except in the last step, in which none is.
     fn record(episode: u32) -> EpisodeRecord {
         let candidate = |value: f32| CandidateRecord {
-            tokens: vec![1, 2],
+            tokens: vec![1; 7],
             action: Some([0.0; 7]),
             malformed: None,
             score: None,
@@ -241,10 +332,40 @@ mod tests {
 
     #[test]
     fn a_record_gives_the_executed_candidates_of_the_steps_that_had_one() {
-        let episode = labelled(&record(3), "cafe").expect("it may teach");
+        let episode = labelled(&record(3), CAFE).expect("it may teach");
         assert_eq!(episode.name, "run-1/widowx_stack_cube-default-0003-sample-n2-t1");
         assert_eq!(episode.hidden, [0.0, 0.5, 1.0, 0.5]);
         assert_eq!((episode.steps, episode.steps_total, episode.is_success), (vec![0, 1], 3, true));
+    }
+
+    #[test]
+    fn drawn_candidates_teach_choosing_and_chosen_ones_do_not() {
+        let mut record = record(0);
+        record.steps.iter_mut().for_each(|step| step.chosen = step.chosen.map(|_| 0));
+        record.steps[0].statistics.is_grasped = true;
+        for (index, candidate) in record.steps[1].candidates.iter_mut().enumerate() {
+            candidate.tokens = vec![9, 1, 1, 1, 1, 1, 1, 1];
+            candidate.action = Some([index as f32, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
+        }
+        let decisions =
+            |record: &EpisodeRecord| labelled(record, CAFE).expect("it may teach").decisions;
+        let drawn = decisions(&record).expect("drawn of two");
+        assert_eq!(drawn.instruction, "stack");
+        assert_eq!(drawn.list.len(), 2);
+        let last = &drawn.list[1];
+        // Hidden states -9 and 1, and the grasp of the step before.
+        assert_eq!(
+            (last.hidden_mean.as_slice(), last.statistics[1]),
+            ([-4.0, 0.5].as_slice(), 1.0)
+        );
+        assert_eq!((last.candidates[0][0], last.candidates[1][0]), (-0.5, 0.5));
+        assert_eq!(drawn.list[0].statistics, [0.0; STATISTICS]);
+
+        let mut forgotten = record.clone();
+        forgotten.steps[1].candidates[1].hidden = None;
+        assert!(decisions(&forgotten).is_none());
+        record.identity.strategy = "medoid".to_owned();
+        assert!(decisions(&record).is_none());
     }
 
     #[test]
@@ -252,7 +373,7 @@ mod tests {
         let check = |change: fn(&mut EpisodeRecord), expected: &str| {
             let mut record = record(0);
             change(&mut record);
-            let error = labelled(&record, "cafe").expect_err(expected);
+            let error = labelled(&record, CAFE).expect_err(expected);
             assert_eq!(error.to_string(), expected);
         };
         check(
@@ -288,11 +409,11 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let runs = [folder.path().to_path_buf()];
         write(folder.path(), &[record(0), record(1)]);
-        assert_eq!(from_runs(&runs, "cafe").expect("two episodes").len(), 2);
+        assert_eq!(from_runs(&runs, CAFE).expect("two episodes").len(), 2);
         let mut bad = record(2);
         bad.identity.configuration = Some(7);
         write(folder.path(), &[bad]);
-        let error = format!("{:#}", from_runs(&runs, "cafe").expect_err("one is bad"));
+        let error = format!("{:#}", from_runs(&runs, CAFE).expect_err("one is bad"));
         assert!(
             error
                 .contains("widowx_stack_cube-default-0002-sample-n2-t1.msgpack: expected a random"),
@@ -315,7 +436,7 @@ mod tests {
         }
         assert!(store.insert(&Label::of_outcome(outcome(&records[3]))).expect("a row"));
         drop(store);
-        let (episodes, set_aside) = from_labels(&path, "cafe").expect("a whole store");
+        let (episodes, set_aside) = from_labels(&path, CAFE).expect("a whole store");
         assert_eq!(episodes.len(), 1);
         let expected = [
             ("another policy", 1),
@@ -323,8 +444,7 @@ mod tests {
             ("seed outside of the collection range", 1),
         ];
         assert_eq!(set_aside, BTreeMap::from(expected));
-        let missing =
-            from_labels(&folder.path().join("none.sqlite"), "cafe").expect_err("no store");
+        let missing = from_labels(&folder.path().join("none.sqlite"), CAFE).expect_err("no store");
         assert!(
             missing.to_string().ends_with("none.sqlite: expected a file, got none"),
             "{missing}"

@@ -7,6 +7,8 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 
+use crate::verifier::Features;
+
 /// One finished episode as the verifier sees it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelledEpisode {
@@ -22,7 +24,32 @@ pub struct LabelledEpisode {
     pub steps: Vec<usize>,
     /// Control steps of the episode.
     pub steps_total: usize,
+    /// What its decisions were between; none unless each step executed the first of several sampled candidates.
+    pub decisions: Option<Decisions>,
 }
+
+/// The decisions of an episode in which the executed candidate was drawn, not chosen.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Decisions {
+    /// What the robot was told.
+    pub instruction: String,
+    /// One for each sample.
+    pub list: Vec<DecisionSample>,
+}
+
+/// One decision.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DecisionSample {
+    /// Mean hidden state of the well-formed candidates.
+    pub hidden_mean: Vec<f32>,
+    /// What the simulator had said after the step before, as 0 or 1; the verifier never sees it.
+    pub statistics: [f32; STATISTICS],
+    /// How each well-formed candidate differs from the others; the first was executed.
+    pub candidates: Vec<Features>,
+}
+
+/// Flags of [`protocol::Statistics`].
+pub const STATISTICS: usize = 9;
 
 /// Episodes to train on, all of one policy.
 #[derive(Clone, Debug)]
@@ -53,6 +80,19 @@ impl TrainingSet {
             ensure!(
                 values == samples * input_size,
                 "episode {}: expected {samples} hidden states of {input_size} values, got {values} values",
+                episode.name
+            );
+            let decisions = episode.decisions.as_ref().map(|decisions| &decisions.list);
+            for (index, decision) in decisions.into_iter().flatten().enumerate() {
+                ensure!(
+                    decision.hidden_mean.len() == input_size && !decision.candidates.is_empty(),
+                    "episode {}, decision {index}: expected candidates and a mean of {input_size} values",
+                    episode.name
+                );
+            }
+            ensure!(
+                decisions.is_none_or(|decisions| decisions.len() == samples),
+                "episode {}: expected {samples} decisions, as many as samples",
                 episode.name
             );
             ensure!(
@@ -122,6 +162,7 @@ mod tests {
             hidden: vec![0.5; 6],
             steps: vec![0, 1, 2],
             steps_total: 3,
+            decisions: None,
         }
     }
 

@@ -18,6 +18,37 @@ pub struct Description {
     pub evidence: Evidence,
     /// How well it separates successes from failures on the held-out episodes.
     pub held_out: Metrics,
+    /// What its choice part was trained on; none when it has none.
+    #[serde(default)]
+    pub choice: Option<ChoiceEvidence>,
+}
+
+/// What the choice part was trained on, and what it is worth by the same episodes, cross-fitted.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ChoiceEvidence {
+    /// Instructions with weights of their own, in the order of the file.
+    pub instructions: Vec<String>,
+    /// Sampled episodes whose decisions had several candidates.
+    pub episodes: usize,
+    /// Their decisions.
+    pub decisions: usize,
+    /// Of choosing the best candidate.
+    pub gain: Gain,
+    /// Of choosing the medoid, by the same measure.
+    pub medoid_gain: Gain,
+}
+
+/// The sum, over an episode's decisions, of what choosing in that decision alone would change.
+///
+/// It compares ways to choose on the same episodes. It is no forecast: changes of many decisions do not add up.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Gain {
+    /// Percentage points of success, mean of the episodes.
+    pub points: f64,
+    /// Of that mean.
+    pub standard_error: f64,
 }
 
 /// How a verifier is trained.
@@ -40,6 +71,12 @@ pub struct Options {
     pub weight_decay: f64,
     /// Share of the episodes of every task that are held out.
     pub held_out_share: f64,
+    /// Whether to fit a choice part when there are episodes for it; without one this is the paper's verifier.
+    pub choice: bool,
+    /// Share of each later change of value that counts for an action's advantage, per control step: TD(lambda)'s lambda.
+    pub advantage_decay: f64,
+    /// Ridge of the choice part's regression, in units of a standardised feature's variance.
+    pub choice_ridge: f64,
 }
 
 impl Default for Options {
@@ -53,6 +90,9 @@ impl Default for Options {
             learning_rate: 3e-4,
             weight_decay: 1e-2,
             held_out_share: 0.2,
+            choice: true,
+            advantage_decay: 0.95,
+            choice_ridge: 0.12,
         }
     }
 }

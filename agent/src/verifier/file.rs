@@ -7,16 +7,24 @@ use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 
-use super::{Description, FILE_BYTES_MAX, Layer, Network, Standardisation};
+use super::{
+    Choice, DEVIATIONS, Description, FEATURES, FILE_BYTES_MAX, Layer, Network, Standardisation,
+};
 
 /// Metadata key of the description; one key, because the order of several would not be the same twice.
 const DESCRIPTION_KEY: &str = "rever.verifier";
 const MEAN: &str = "standardisation.mean";
 const DEVIATION: &str = "standardisation.deviation";
+const CHOICE: &str = "choice.shared";
+const CHOICE_INSTRUCTIONS: &str = "choice.instructions";
 const LAYERS: [&str; 3] = ["hidden_1", "hidden_2", "output"];
 
 /// The bytes of a file: the same verifier always gives the same bytes.
-pub fn encode(network: &Network, description: &Description) -> anyhow::Result<Vec<u8>> {
+pub fn encode(
+    network: &Network,
+    choice: Option<&Choice>,
+    description: &Description,
+) -> anyhow::Result<Vec<u8>> {
     let size = network.input_size();
     let Standardisation { mean, deviation } = network.standardisation();
     let mut tensors = vec![
@@ -28,6 +36,12 @@ pub fn encode(network: &Network, description: &Description) -> anyhow::Result<Ve
         tensors.push((format!("{name}.weight"), shape, bytes_of(layer.weight())));
         tensors.push((format!("{name}.bias"), vec![layer.outputs()], bytes_of(layer.bias())));
     }
+    if let Some(Choice { shared, instructions }) = choice {
+        let rows: Vec<f32> = instructions.values().flatten().copied().collect();
+        tensors.push((CHOICE.to_owned(), vec![FEATURES], bytes_of(shared)));
+        let shape = vec![instructions.len(), DEVIATIONS];
+        tensors.push((CHOICE_INSTRUCTIONS.to_owned(), shape, bytes_of(&rows)));
+    }
     let views = tensors
         .iter()
         .map(|(name, shape, bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)));
@@ -38,7 +52,7 @@ pub fn encode(network: &Network, description: &Description) -> anyhow::Result<Ve
 }
 
 /// Reads a file's bytes; every tensor must be there with its size, and no other.
-pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Description)> {
+pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Option<Choice>, Description)> {
     let bytes_found = bytes.len() as u64;
     ensure!(
         bytes_found <= FILE_BYTES_MAX,
@@ -55,7 +69,8 @@ pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Description)> {
         serde_json::from_str(description).context("verifier description")?;
 
     let tensors = SafeTensors::deserialize(bytes).context("verifier file: expected safetensors")?;
-    let expected = 2 + 2 * LAYERS.len();
+    let choice_tensors = if description.choice.is_some() { 2 } else { 0 };
+    let expected = 2 + 2 * LAYERS.len() + choice_tensors;
     ensure!(
         tensors.len() == expected,
         "verifier file: expected {expected} tensors, got {}",
@@ -80,7 +95,21 @@ pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Description)> {
     }
     let layers: [Layer; 3] =
         layers.try_into().ok().context("verifier file: expected three layers")?;
-    Ok((Network::new(standardisation, layers)?, description))
+    let choice = description.choice.as_ref();
+    let choice = choice.map(|choice| read_choice(&tensors, &choice.instructions)).transpose()?;
+    Ok((Network::new(standardisation, layers)?, choice, description))
+}
+
+fn read_choice(tensors: &SafeTensors<'_>, instructions: &[String]) -> anyhow::Result<Choice> {
+    ensure!(
+        instructions.is_sorted_by(|a, b| a < b),
+        "choice instructions: expected each once and in order, got {instructions:?}"
+    );
+    let shared = read(tensors, CHOICE, &[FEATURES])?;
+    let rows = read(tensors, CHOICE_INSTRUCTIONS, &[instructions.len(), DEVIATIONS])?;
+    let rows = rows.chunks_exact(DEVIATIONS).map(|row| row.try_into().expect("a whole row"));
+    let shared = shared.try_into().expect("as many as features");
+    Choice { shared, instructions: instructions.iter().cloned().zip(rows).collect() }.checked()
 }
 
 /// SHA-256 in hexadecimal.

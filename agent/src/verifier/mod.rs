@@ -1,5 +1,11 @@
-//! The verifier: a small network that reads a candidate's last hidden state and says how likely the episode succeeds.
+//! The verifier: says how likely the episode succeeds if a candidate is executed.
+//!
+//! ```text
+//! last hidden states ─▶ mean ─▶ network (equation 4): how promising the situation is ─┐
+//! actions ─▶ deviations from the siblings ─▶ choice: which candidate is better ───────┴▶ logit of each
+//! ```
 
+mod choice;
 mod description;
 mod file;
 mod metrics;
@@ -9,16 +15,36 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 
-pub use description::{Description, Evidence, Options};
+use crate::strategy::CandidateAction;
+
+pub use choice::{Choice, DEVIATIONS, FEATURES, Features, features};
+pub use description::{ChoiceEvidence, Description, Evidence, Gain, Options};
 pub use metrics::{Discrimination, HeldOut, Metrics, weighted_loss};
 pub use network::{Layer, Network, Standardisation};
 
 /// A verifier file larger than this is refused before it is read: the largest sensible one is a few megabytes.
 pub const FILE_BYTES_MAX: u64 = 64 * 1024 * 1024;
 
+/// Logits per unit of probability: the slope of the logit where success and failure are equally likely.
+const LOGITS_PER_PROBABILITY: f32 = 4.0;
+
+/// The candidates of one decision, as the verifier sees them; the lists run in parallel.
+#[derive(Clone, Copy, Debug)]
+pub struct Siblings<'a> {
+    /// Each candidate's last hidden state.
+    pub hidden: &'a [&'a [f32]],
+    /// What each would do; `None` is a malformed one.
+    pub actions: &'a [Option<CandidateAction>],
+    /// What the robot was told.
+    pub instruction: &'a str,
+    /// One unit of each number of an action.
+    pub action_scale: &'a [f32; DEVIATIONS],
+}
+
 /// A trained verifier for one policy.
 pub struct Verifier {
     network: Network,
+    choice: Option<Choice>,
     description: Description,
     /// The file that this is, so that a digest is never of a second encoding.
     bytes: Vec<u8>,
@@ -53,16 +79,20 @@ impl Verifier {
 
     /// Reads a verifier file only to show what it says about itself.
     pub fn from_bytes_of_any_policy(bytes: &[u8]) -> anyhow::Result<Verifier> {
-        let (network, description) = file::decode(bytes)?;
+        let (network, choice, description) = file::decode(bytes)?;
         let digest = file::digest(bytes);
-        Ok(Verifier { network, description, bytes: bytes.to_vec(), digest })
+        Ok(Verifier { network, choice, description, bytes: bytes.to_vec(), digest })
     }
 
-    /// Joins a trained network with what is known about it.
+    /// Joins trained weights with what is known about them.
     ///
     /// It is made into a file and read back, so that it is in memory exactly what any reader of the file gets.
-    pub fn new(network: &Network, description: &Description) -> anyhow::Result<Verifier> {
-        Verifier::from_bytes_of_any_policy(&file::encode(network, description)?)
+    pub fn new(
+        network: &Network,
+        choice: Option<&Choice>,
+        description: &Description,
+    ) -> anyhow::Result<Verifier> {
+        Verifier::from_bytes_of_any_policy(&file::encode(network, choice, description)?)
     }
 
     /// The contents of this verifier's file.
@@ -80,12 +110,37 @@ impl Verifier {
         &self.description
     }
 
-    /// The logit of every row, a row being one candidate's last hidden state.
+    /// The logit of every candidate of one decision.
     ///
-    /// A row's logit depends on that row alone, to the last bit, whatever else is in the batch.
-    pub fn logits(&self, rows: &[&[f32]]) -> Vec<f32> {
-        rows.iter().map(|row| self.network.logit(row)).collect()
+    /// Without a choice part a logit depends on the candidate's own hidden state alone. With it, the network reads the
+    /// mean hidden state, so that it cannot prefer the candidate that merely claims more progress, and the choice part
+    /// tells the candidates apart. A malformed candidate's logit means nothing.
+    pub fn logits(&self, siblings: &Siblings<'_>) -> Vec<f32> {
+        let Siblings { hidden, actions, instruction, action_scale } = siblings;
+        assert_eq!(hidden.len(), actions.len(), "one action per hidden state");
+        let Some(choice) = &self.choice else {
+            return hidden.iter().map(|row| self.network.logit(row)).collect();
+        };
+        let well_formed = hidden.iter().zip(*actions).filter(|(_, action)| action.is_some());
+        let rows: Vec<&[f32]> = well_formed.map(|(row, _)| *row).collect();
+        let situation = self.network.logit(&mean_hidden(&rows, self.network.input_size()));
+        let logit = |features: Option<Features>| {
+            let advantage =
+                features.map_or(0.0, |features| choice.advantage(instruction, &features));
+            situation + LOGITS_PER_PROBABILITY * advantage
+        };
+        features(actions, action_scale).into_iter().map(logit).collect()
     }
+}
+
+/// The mean of hidden states of `size` values; zeros when there is none.
+pub fn mean_hidden(rows: &[&[f32]], size: usize) -> Vec<f32> {
+    let mut mean = vec![0.0; size];
+    for row in rows {
+        mean.iter_mut().zip(*row).for_each(|(mean, value)| *mean += value);
+    }
+    mean.iter_mut().for_each(|mean| *mean /= rows.len().max(1) as f32);
+    mean
 }
 
 /// The probability that belongs to a logit.
@@ -119,8 +174,66 @@ mod tests {
             options: Options { hidden_sizes: [4, 3], ..Options::default() },
             evidence: Evidence::default(),
             held_out: Metrics::measure(&HeldOut::default(), 0.5),
+            choice: None,
         };
-        Verifier::new(&network, &description).expect("a whole verifier")
+        Verifier::new(&network, None, &description).expect("a whole verifier")
+    }
+
+    /// The same with weights that prefer what deviates towards +x, doubly so when told to push.
+    fn choosing(seed: u64) -> Verifier {
+        let plain = arbitrary(seed);
+        let mut shared = [0.0; FEATURES];
+        shared[0] = 0.25;
+        let push = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+        let choice = Choice { shared, instructions: [("push".to_owned(), push)].into() };
+        let evidence =
+            ChoiceEvidence { instructions: vec!["push".to_owned()], ..made_up_evidence() };
+        let description = Description { choice: Some(evidence), ..plain.description.clone() };
+        Verifier::new(&plain.network, Some(&choice), &description).expect("a whole verifier")
+    }
+
+    fn made_up_evidence() -> ChoiceEvidence {
+        let gain = Gain { points: 1.0, standard_error: 0.5 };
+        ChoiceEvidence {
+            instructions: Vec::new(),
+            episodes: 2,
+            decisions: 20,
+            gain: gain.clone(),
+            medoid_gain: gain,
+        }
+    }
+
+    /// Logits of hidden states whose candidates all do the same.
+    fn alike(verifier: &Verifier, hidden: &[&[f32]]) -> Vec<f32> {
+        let actions = vec![acting(0.0); hidden.len()];
+        let siblings =
+            Siblings { hidden, actions: &actions, instruction: "push", action_scale: &[1.0; 7] };
+        verifier.logits(&siblings)
+    }
+
+    fn acting(x: f32) -> Option<CandidateAction> {
+        Some(CandidateAction { tokens: [500; 7], action: [x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] })
+    }
+
+    #[test]
+    fn the_choice_part_ranks_by_action_and_the_situation_by_the_mean() {
+        let verifier = choosing(1);
+        let rows: [&[f32]; 3] = [&[0.1; 5], &[9.0; 5], &[0.5; 5]];
+        // The second is malformed: its hidden state must not count.
+        let actions = [acting(-1.0), None, acting(1.0)];
+        let logits = |instruction| {
+            let siblings =
+                Siblings { hidden: &rows, actions: &actions, instruction, action_scale: &[2.0; 7] };
+            verifier.logits(&siblings)
+        };
+        let situation = verifier.network.logit(&[0.3; 5]);
+        let near = |found: f32, expected: f32| (found - expected).abs() < 1e-5;
+        // Half a unit off the mean: 4 logits per probability x 0.25 x 0.5.
+        let pull = logits("pull");
+        assert!(near(pull[0], situation - 0.5) && near(pull[2], situation + 0.5), "{pull:?}");
+        let push = logits("push");
+        assert!(near(push[0], situation - 1.5) && near(push[2], situation + 1.5), "{push:?}");
+        assert_eq!(push[1], situation);
     }
 
     #[test]
@@ -131,6 +244,10 @@ mod tests {
         assert_eq!(again.digest(), verifier.digest());
         assert_eq!(again.description(), verifier.description());
         assert_eq!(again.network, verifier.network);
+        let choosing = choosing(1);
+        let again = Verifier::from_bytes(choosing.bytes(), "cafe").expect("the same policy");
+        assert_eq!((&again.choice, again.bytes()), (&choosing.choice, choosing.bytes()));
+        assert!(again.choice.is_some() && verifier.choice.is_none());
         assert_eq!(arbitrary(1).digest(), verifier.digest());
         assert_ne!(arbitrary(2).digest(), verifier.digest());
     }
@@ -179,9 +296,9 @@ mod tests {
             .map(|row| (0..5).map(|i| (row * 7 + i * 3) as f32 * 0.013 - 2.0).collect())
             .collect();
         let rows: Vec<&[f32]> = rows.iter().map(Vec::as_slice).collect();
-        let together = verifier.logits(&rows);
+        let together = alike(&verifier, &rows);
         for (row, logit) in rows.iter().zip(together) {
-            assert_eq!(verifier.logits(&[row])[0].to_bits(), logit.to_bits());
+            assert_eq!(alike(&verifier, &[row])[0].to_bits(), logit.to_bits());
         }
     }
 
