@@ -17,7 +17,7 @@ use crate::strategy::Strategy;
 use crate::suite::Arm;
 
 /// Version of the format; a record of another version is refused.
-pub const RECORD_VERSION: u32 = 1;
+pub const RECORD_VERSION: u32 = 2;
 
 /// What is known of a finished episode.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -132,6 +132,8 @@ pub struct CandidateRecord {
     pub score: Option<f32>,
     /// Of the sampled tokens at temperature 1.
     pub log_probability: f32,
+    /// Of each token, at temperature 1.
+    pub log_probabilities: Vec<f32>,
     /// The last token's final hidden state, 16-bit floats, little endian; always there for the chosen candidate.
     #[serde(with = "serde_bytes")]
     pub hidden: Option<Vec<u8>>,
@@ -217,6 +219,7 @@ pub(crate) mod tests {
             malformed: None,
             score: Some(0.75),
             log_probability: -3.5,
+            log_probabilities: vec![-1.0, -2.0, -0.5],
             hidden: Some(hidden_to_bytes(&[0.5, -2.0])),
         };
         let malformed = CandidateRecord {
@@ -292,8 +295,8 @@ pub(crate) mod tests {
         let bytes = rmp_serde::to_vec_named(&made_up(0)).expect("bytes");
         check(&bytes[..bytes.len() - 1], "is not an episode record");
         check(&[&bytes[..], &[0]].concat(), "expected one record, got 1 bytes after it");
-        let later = EpisodeRecord { version: 2, ..made_up(0) };
-        check(&rmp_serde::to_vec_named(&later).expect("bytes"), "expected record version 1, got 2");
+        let later = EpisodeRecord { version: 3, ..made_up(0) };
+        check(&rmp_serde::to_vec_named(&later).expect("bytes"), "expected record version 2, got 3");
     }
 
     #[test]

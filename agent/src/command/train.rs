@@ -92,7 +92,10 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let started = Instant::now();
     let policy = Policy::load(&arguments.policy)?;
     let action_scale = policy.action_scale();
-    let reader = Reader { policy: policy.digest(), action_scale: &action_scale };
+    let confidence =
+        |tokens: &[u32], log_probabilities: &[f32]| policy.confidence(tokens, log_probabilities);
+    let reader =
+        Reader { policy: policy.digest(), action_scale: &action_scale, confidence: &confidence };
     let (episodes, set_aside) = read(&arguments, reader)?;
     ensure!(
         !episodes.is_empty(),

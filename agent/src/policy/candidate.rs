@@ -35,6 +35,8 @@ pub struct Candidate {
     pub tokens: Vec<u32>,
     /// Of all tokens and of `</s>`, at temperature 1 whatever the temperature was.
     pub log_probability: f32,
+    /// Of each token, at temperature 1.
+    pub log_probabilities: Vec<f32>,
     /// The last token's hidden state after the final norm.
     pub hidden: Vec<f32>,
     /// What the tokens mean, or why they mean nothing.

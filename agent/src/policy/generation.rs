@@ -40,6 +40,8 @@ pub struct Completion {
     /// Without `</s>`.
     pub tokens: Vec<u32>,
     pub log_probability: f64,
+    /// Of each token.
+    pub log_probabilities: Vec<f32>,
     /// Of the last token.
     pub hidden: Vec<f32>,
     temperature: f32,
@@ -89,6 +91,7 @@ fn start(sessions: &[Continuation<'_>]) -> Vec<Completion> {
             session: index,
             tokens: Vec::new(),
             log_probability: 0.0,
+            log_probabilities: Vec::new(),
             hidden: Vec::new(),
             temperature: session.temperature,
             stream: Stream::new(session.seed, candidate),
@@ -138,6 +141,7 @@ impl Completion {
             return Ok(None);
         }
         self.tokens.push(token);
+        self.log_probabilities.push(log_probability as f32);
         let done = self.tokens.len() > self.tokens_max || is_complete(&self.tokens, limits.bins);
         Ok(if done { None } else { Some(token) })
     }

@@ -42,6 +42,7 @@ mod segment;
 // Tokens: prompts in, draws, meaning.
 mod actions;
 mod candidate;
+mod confidence;
 mod generation;
 mod lanes;
 mod prompt;
@@ -53,6 +54,7 @@ mod timings;
 
 pub use backend::Backend;
 pub use candidate::{Candidate, Parsed, Proposal, ProposalRequest};
+pub use confidence::{Confidence, PARTS};
 pub use protocol::message::Image;
 pub use reasoning::{Malformed, Reasoning, VisibleObject};
 pub use timings::Timings;
@@ -128,6 +130,11 @@ impl Policy {
         candidate::parse(tokens, self.config.reasoning, &self.bins, &self.prompter)
     }
 
+    /// How sure the policy was of each part of a candidate; one log-probability per token.
+    pub fn confidence(&self, tokens: &[u32], log_probabilities: &[f32]) -> Confidence {
+        confidence::confidence(tokens, log_probabilities, &self.bins, &self.prompter)
+    }
+
     /// Samples the candidates of every request; all requests share the network's products.
     pub fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
         if requests.is_empty() {
@@ -158,6 +165,7 @@ impl Policy {
             proposals[completion.session].candidates.push(Candidate {
                 parsed: self.parse(&completion.tokens),
                 log_probability: completion.log_probability as f32,
+                log_probabilities: completion.log_probabilities,
                 tokens: completion.tokens,
                 hidden: completion.hidden,
             });

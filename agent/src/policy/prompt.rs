@@ -60,6 +60,11 @@ impl Prompter {
         Ok(ids)
     }
 
+    /// Whether an id's text has a colon.
+    pub fn has_colon(&self, id: u32) -> bool {
+        self.tokenizer.id_to_token(id).is_some_and(|text| text.contains(':'))
+    }
+
     /// The text of a completion, with the tag that its prompt may have opened.
     pub fn text(&self, ids: &[u32]) -> String {
         // Ids come out of the vocabulary, so only a broken decoder in tokenizer.json can fail here.

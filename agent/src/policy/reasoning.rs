@@ -3,7 +3,7 @@
 use std::fmt;
 
 /// ECoT's tags in order. `ACTION:` ends the text; what follows it are action tokens.
-const TAGS: [&str; 9] = [
+pub const TAGS: [&str; 9] = [
     "TASK:",
     "PLAN:",
     "VISIBLE OBJECTS:",
@@ -119,6 +119,12 @@ fn sections(text: &str) -> Result<[&str; 8], Malformed> {
         }
     }
     Ok(sections)
+}
+
+/// The last tag that ends behind `from`, as an index of [`TAGS`]; none when no tag does.
+pub fn last_tag(text: &str, from: usize) -> Option<usize> {
+    let found = tags_in(text).into_iter().rev().find(|(at, tag)| at + tag.len() > from);
+    found.and_then(|(_, tag)| TAGS.iter().position(|known| *known == tag))
 }
 
 /// Every tag with its byte offset; it begins the text or follows a space, and the longest wins.

@@ -144,6 +144,7 @@ fn candidate(level: f32, random: &mut StdRng) -> CandidateRecord {
         malformed: (!is_well_formed).then(|| "expected 7 action tokens, got </s>".to_owned()),
         score: is_well_formed.then(|| (level + random.random_range(-0.2..0.2)).clamp(0.0, 1.0)),
         log_probability: -12.5,
+        log_probabilities: Vec::new(),
         hidden: None,
         tokens,
     }

@@ -7,13 +7,13 @@ use anyhow::Result;
 use protocol::{Observation, Transition};
 
 use super::queue::Job;
-use crate::policy::{Candidate, Proposal, ProposalRequest};
+use crate::policy::{Candidate, Policy, Proposal, ProposalRequest};
 use crate::record::{
     CandidateRecord, EpisodeRecord, RECORD_VERSION, StepRecord, Versions, hidden_to_bytes,
 };
 use crate::strategy::{CandidateAction, Decision};
 use crate::suite::step_seed;
-use crate::verifier::{Siblings, Verifier, probability};
+use crate::verifier::{Sibling, Siblings, Verifier, probability};
 use crate::video::Video;
 use crate::wire::Episode;
 
@@ -98,16 +98,17 @@ impl Attempt {
     }
 
     /// The verifier's logits of the candidates.
-    pub fn score(&self, proposal: &Proposal, action_scale: &[f32; 7]) -> Option<Vec<f32>> {
+    pub fn score(&self, proposal: &Proposal, policy: &Policy) -> Option<Vec<f32>> {
         let verifier = self.verifier.as_ref()?;
         let hidden: Vec<&[f32]> = proposal.candidates.iter().map(|one| &*one.hidden).collect();
-        let actions: Vec<_> = proposal.candidates.iter().map(candidate_action).collect();
-        Some(verifier.logits(&Siblings {
-            hidden: &hidden,
-            actions: &actions,
-            instruction: &self.instruction,
-            action_scale,
-        }))
+        let sibling = |candidate: &Candidate| {
+            let action = candidate_action(candidate)?;
+            let Candidate { tokens, log_probabilities, .. } = candidate;
+            Some(Sibling { action, confidence: policy.confidence(tokens, log_probabilities) })
+        };
+        let candidates: Vec<Option<Sibling>> = proposal.candidates.iter().map(sibling).collect();
+        let action_scale = &policy.action_scale();
+        Some(verifier.logits(&Siblings { hidden: &hidden, candidates: &candidates, action_scale }))
     }
 
     /// Chooses a candidate, notes the step, and says what to do.
@@ -215,6 +216,7 @@ fn candidate_record(
         // A malformed candidate has no action whose success could be likely.
         score: logit.filter(|_| is_well_formed).map(probability),
         log_probability: candidate.log_probability,
+        log_probabilities: candidate.log_probabilities,
         hidden: keep_hidden.then(|| hidden_to_bytes(&candidate.hidden)),
         tokens: candidate.tokens,
     }

@@ -116,9 +116,8 @@ impl Rollout<'_> {
     }
 
     fn score(&self, attempts: &[Attempt], proposals: &[Proposal]) -> Vec<Option<Vec<f32>>> {
-        let scale = self.policy.action_scale();
         let decisions = attempts.iter().zip(proposals);
-        decisions.map(|(attempt, proposal)| attempt.score(proposal, &scale)).collect()
+        decisions.map(|(attempt, proposal)| attempt.score(proposal, self.policy)).collect()
     }
 
     fn choose(

@@ -10,7 +10,7 @@ use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 
 use super::learner::{Learner, Samples};
-use super::set::{Decisions, LabelledEpisode};
+use super::set::{DecisionSample, LabelledEpisode};
 use crate::verifier::{Network, Standardisation};
 
 /// Parts of the episodes, of which each is valued by a critic that was fitted to the others.
@@ -30,25 +30,27 @@ pub struct Lesson<'a> {
     /// Its outcome.
     pub is_success: bool,
     /// Its decisions.
-    pub decisions: &'a Decisions,
+    pub decisions: &'a [DecisionSample],
     /// The part that it belongs to.
     pub fold: usize,
 }
 
+impl Lesson<'_> {
+    /// The lesson of an episode that has decisions.
+    fn of(episode: &LabelledEpisode) -> Option<Lesson<'_>> {
+        let LabelledEpisode { task, is_success, decisions, .. } = episode;
+        let decisions = decisions.as_deref().filter(|decisions| !decisions.is_empty())?;
+        Some(Lesson { task, is_success: *is_success, decisions, fold: 0 })
+    }
+}
+
 /// The episodes with decisions, dealt to the folds.
-pub fn lessons<'a>(episodes: &'a [LabelledEpisode], seed: u64) -> Vec<Lesson<'a>> {
-    let with_decisions: Vec<(&'a LabelledEpisode, &'a Decisions)> = episodes
-        .iter()
-        .filter_map(|episode| Some((episode, episode.decisions.as_ref()?)))
-        .filter(|(_, decisions)| !decisions.list.is_empty())
-        .collect();
-    let mut folds: Vec<usize> = (0..with_decisions.len()).map(|index| index % FOLDS).collect();
+pub fn lessons(episodes: &[LabelledEpisode], seed: u64) -> Vec<Lesson<'_>> {
+    let mut lessons: Vec<Lesson<'_>> = episodes.iter().filter_map(Lesson::of).collect();
+    let mut folds: Vec<usize> = (0..lessons.len()).map(|index| index % FOLDS).collect();
     folds.shuffle(&mut StdRng::seed_from_u64(seed));
-    let lesson = |((episode, decisions), fold): ((&'a LabelledEpisode, &'a Decisions), usize)| {
-        let LabelledEpisode { task, is_success, .. } = episode;
-        Lesson { task, is_success: *is_success, decisions, fold }
-    };
-    with_decisions.into_iter().zip(folds).map(lesson).collect()
+    lessons.iter_mut().zip(folds).for_each(|(lesson, fold)| lesson.fold = fold);
+    lessons
 }
 
 /// The advantage of every executed action, lesson by lesson, as changes of the probability of success.
@@ -89,8 +91,8 @@ fn rows(lessons: &[Lesson<'_>]) -> Vec<Vec<Vec<f32>>> {
     tasks.sort_unstable();
     tasks.dedup();
     let row = |lesson: &Lesson<'_>| -> Vec<Vec<f32>> {
-        let count = lesson.decisions.list.len() as f32;
-        let decisions = lesson.decisions.list.iter().enumerate();
+        let count = lesson.decisions.len() as f32;
+        let decisions = lesson.decisions.iter().enumerate();
         decisions
             .map(|(step, decision)| {
                 let mut row = decision.hidden_mean.clone();

@@ -17,7 +17,7 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 
-pub use set::{DecisionSample, Decisions, LabelledEpisode, STATISTICS, Split, TrainingSet};
+pub use set::{DecisionSample, LabelledEpisode, STATISTICS, Split, TrainingSet};
 
 use crate::verifier::{
     Description, Evidence, HeldOut, Metrics, Network, Options, Standardisation, Verifier,
@@ -257,8 +257,7 @@ mod tests {
         // And the sign is right: more of the second feature is better.
         let logits = verifier.logits(&Siblings {
             hidden: &[&[5.0, 9.0, 5.0, 5.0], &[5.0, 1.0, 5.0, 5.0]],
-            actions: &[None, None],
-            instruction: "",
+            candidates: &[None, None],
             action_scale: &[1.0; 7],
         });
         assert!(logits[0] > 1.0 && logits[1] < -1.0, "{logits:?}");

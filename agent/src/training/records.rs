@@ -7,21 +7,24 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail, ensure};
 use protocol::{EpisodeOutcome, Statistics};
 
-use super::{DecisionSample, Decisions, LabelledEpisode, STATISTICS};
+use super::{DecisionSample, LabelledEpisode, STATISTICS};
 use crate::labels::{LabelStore, outcome};
+use crate::policy::Confidence;
 use crate::record::{CandidateRecord, EpisodeRecord, StepRecord, hidden_from_bytes};
 use crate::run::{record_path, recorded};
 use crate::strategy::{CandidateAction, Strategy};
 use crate::suite::SeedRange;
-use crate::verifier::{DEVIATIONS, Features, features, mean_hidden};
+use crate::verifier::{Sibling, features, mean_hidden};
 
 /// What records are read for.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct Reader<'a> {
     /// Digest of the policy whose verifier is trained.
     pub policy: &'a str,
     /// One unit of each number of its actions.
-    pub action_scale: &'a [f32; DEVIATIONS],
+    pub action_scale: &'a [f32; 7],
+    /// How sure it was of a candidate's parts, from tokens and log-probabilities.
+    pub confidence: &'a dyn Fn(&[u32], &[f32]) -> Confidence,
 }
 
 /// Why an episode must not teach the verifier of a policy.
@@ -189,7 +192,6 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
             }
         }
     }
-    let instruction = record.instruction.clone();
     Ok(LabelledEpisode {
         name: format!("{}/{}", record.identity.run, record.identity.id()),
         task: record.identity.task.clone(),
@@ -197,7 +199,7 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
         hidden,
         steps,
         steps_total: record.steps.len(),
-        decisions: decisions.map(|list| Decisions { instruction, list }),
+        decisions,
     })
 }
 
@@ -207,7 +209,8 @@ fn decision(
     before: Statistics,
     reader: Reader<'_>,
 ) -> anyhow::Result<Option<DecisionSample>> {
-    let actions: Vec<_> = step.candidates.iter().map(candidate_action).collect();
+    let siblings = step.candidates.iter().map(|candidate| sibling(candidate, reader));
+    let siblings = siblings.collect::<anyhow::Result<Vec<_>>>()?;
     let well_formed = step.candidates.iter().filter(|candidate| candidate.action.is_some());
     let Some(bytes) = well_formed.map(|one| one.hidden.as_ref()).collect::<Option<Vec<_>>>() else {
         return Ok(None);
@@ -220,14 +223,7 @@ fn decision(
         "expected hidden states of one size, got several"
     );
     let rows: Vec<&[f32]> = rows.iter().map(Vec::as_slice).collect();
-    let candidates: Vec<Features> =
-        features(&actions, reader.action_scale).into_iter().flatten().collect();
-    ensure!(
-        candidates.len() == rows.len(),
-        "expected seven action tokens of each of {} candidates, got {} with them",
-        rows.len(),
-        candidates.len()
-    );
+    let candidates = features(&siblings, reader.action_scale).into_iter().flatten().collect();
     Ok(Some(DecisionSample {
         hidden_mean: mean_hidden(&rows, size),
         statistics: flags(before),
@@ -235,10 +231,23 @@ fn decision(
     }))
 }
 
-/// What the candidate would do; its tokens end with the seven of the action.
-fn candidate_action(candidate: &CandidateRecord) -> Option<CandidateAction> {
-    let tokens = candidate.tokens.last_chunk()?;
-    Some(CandidateAction { tokens: *tokens, action: candidate.action? })
+/// The candidate beside others; none when it is malformed.
+fn sibling(candidate: &CandidateRecord, reader: Reader<'_>) -> anyhow::Result<Option<Sibling>> {
+    let CandidateRecord { tokens, log_probabilities, action, .. } = candidate;
+    let Some(action) = *action else { return Ok(None) };
+    let action_tokens = tokens.last_chunk();
+    let action_tokens = action_tokens.filter(|_| tokens.len() == log_probabilities.len());
+    let action_tokens = action_tokens.with_context(|| {
+        format!(
+            "expected at least 7 tokens with as many log-probabilities, got {} and {}",
+            tokens.len(),
+            log_probabilities.len()
+        )
+    })?;
+    Ok(Some(Sibling {
+        action: CandidateAction { tokens: *action_tokens, action },
+        confidence: (reader.confidence)(tokens, log_probabilities),
+    }))
 }
 
 fn flags(statistics: Statistics) -> [f32; STATISTICS] {
@@ -271,12 +280,22 @@ fn flags(statistics: Statistics) -> [f32; STATISTICS] {
 mod tests {
     use super::*;
     use crate::labels::Label;
+    use crate::policy::PARTS;
     use crate::record::{
         CandidateRecord, EpisodeIdentity, RECORD_VERSION, StepRecord, Versions, hidden_to_bytes,
     };
     use protocol::Statistics;
 
-    const CAFE: Reader<'_> = Reader { policy: "cafe", action_scale: &[1.0; 7] };
+    /// The first part's confidence is the first token's log-probability.
+    const CAFE: Reader<'_> = Reader {
+        policy: "cafe",
+        action_scale: &[1.0; 7],
+        confidence: &|_, log_probabilities| {
+            let mut confidence = [0.0; PARTS];
+            confidence[0] = log_probabilities[0];
+            confidence
+        },
+    };
 
     /// Three steps with two candidates each; the second is executed, except in the last step, in which none is.
     fn record(episode: u32) -> EpisodeRecord {
@@ -286,6 +305,7 @@ mod tests {
             malformed: None,
             score: None,
             log_probability: -1.0,
+            log_probabilities: vec![-0.5; 7],
             hidden: Some(hidden_to_bytes(&[value, 0.5])),
         };
         let step = |index: usize| StepRecord {
@@ -343,23 +363,19 @@ mod tests {
         let mut record = record(0);
         record.steps.iter_mut().for_each(|step| step.chosen = step.chosen.map(|_| 0));
         record.steps[0].statistics.is_grasped = true;
-        for (index, candidate) in record.steps[1].candidates.iter_mut().enumerate() {
-            candidate.tokens = vec![9, 1, 1, 1, 1, 1, 1, 1];
-            candidate.action = Some([index as f32, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
-        }
+        record.steps[1].candidates[1].log_probabilities[0] = -1.5;
         let decisions =
             |record: &EpisodeRecord| labelled(record, CAFE).expect("it may teach").decisions;
         let drawn = decisions(&record).expect("drawn of two");
-        assert_eq!(drawn.instruction, "stack");
-        assert_eq!(drawn.list.len(), 2);
-        let last = &drawn.list[1];
+        assert_eq!(drawn.len(), 2);
+        let last = &drawn[1];
         // Hidden states -9 and 1, and the grasp of the step before.
         assert_eq!(
             (last.hidden_mean.as_slice(), last.statistics[1]),
             ([-4.0, 0.5].as_slice(), 1.0)
         );
-        assert_eq!((last.candidates[0][0], last.candidates[1][0]), (-0.5, 0.5));
-        assert_eq!(drawn.list[0].statistics, [0.0; STATISTICS]);
+        assert_eq!((last.candidates[0][0], last.candidates[1][0]), (0.5, -0.5));
+        assert_eq!(drawn[0].statistics, [0.0; STATISTICS]);
 
         let mut forgotten = record.clone();
         forgotten.steps[1].candidates[1].hidden = None;

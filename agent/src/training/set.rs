@@ -24,17 +24,8 @@ pub struct LabelledEpisode {
     pub steps: Vec<usize>,
     /// Control steps of the episode.
     pub steps_total: usize,
-    /// What its decisions were between; none unless each step executed the first of several sampled candidates.
-    pub decisions: Option<Decisions>,
-}
-
-/// The decisions of an episode in which the executed candidate was drawn, not chosen.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Decisions {
-    /// What the robot was told.
-    pub instruction: String,
-    /// One for each sample.
-    pub list: Vec<DecisionSample>,
+    /// What the decision of each sample was between; none unless the executed candidates were drawn, not chosen.
+    pub decisions: Option<Vec<DecisionSample>>,
 }
 
 /// One decision.
@@ -82,7 +73,7 @@ impl TrainingSet {
                 "episode {}: expected {samples} hidden states of {input_size} values, got {values} values",
                 episode.name
             );
-            let decisions = episode.decisions.as_ref().map(|decisions| &decisions.list);
+            let decisions = episode.decisions.as_ref();
             for (index, decision) in decisions.into_iter().flatten().enumerate() {
                 ensure!(
                     decision.hidden_mean.len() == input_size && !decision.candidates.is_empty(),

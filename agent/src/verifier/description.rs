@@ -27,8 +27,6 @@ pub struct Description {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ChoiceEvidence {
-    /// Instructions with weights of their own, in the order of the file.
-    pub instructions: Vec<String>,
     /// Sampled episodes whose decisions had several candidates.
     pub episodes: usize,
     /// Their decisions.

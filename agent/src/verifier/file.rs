@@ -7,16 +7,13 @@ use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 
-use super::{
-    Choice, DEVIATIONS, Description, FEATURES, FILE_BYTES_MAX, Layer, Network, Standardisation,
-};
+use super::{Choice, Description, FEATURES, FILE_BYTES_MAX, Layer, Network, Standardisation};
 
 /// Metadata key of the description; one key, because the order of several would not be the same twice.
 const DESCRIPTION_KEY: &str = "rever.verifier";
 const MEAN: &str = "standardisation.mean";
 const DEVIATION: &str = "standardisation.deviation";
-const CHOICE: &str = "choice.shared";
-const CHOICE_INSTRUCTIONS: &str = "choice.instructions";
+const CHOICE: &str = "choice.weight";
 const LAYERS: [&str; 3] = ["hidden_1", "hidden_2", "output"];
 
 /// The bytes of a file: the same verifier always gives the same bytes.
@@ -36,11 +33,8 @@ pub fn encode(
         tensors.push((format!("{name}.weight"), shape, bytes_of(layer.weight())));
         tensors.push((format!("{name}.bias"), vec![layer.outputs()], bytes_of(layer.bias())));
     }
-    if let Some(Choice { shared, instructions }) = choice {
-        let rows: Vec<f32> = instructions.values().flatten().copied().collect();
-        tensors.push((CHOICE.to_owned(), vec![FEATURES], bytes_of(shared)));
-        let shape = vec![instructions.len(), DEVIATIONS];
-        tensors.push((CHOICE_INSTRUCTIONS.to_owned(), shape, bytes_of(&rows)));
+    if let Some(choice) = choice {
+        tensors.push((CHOICE.to_owned(), vec![FEATURES], bytes_of(choice.weights())));
     }
     let views = tensors
         .iter()
@@ -69,7 +63,7 @@ pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Option<Choice>, Descript
         serde_json::from_str(description).context("verifier description")?;
 
     let tensors = SafeTensors::deserialize(bytes).context("verifier file: expected safetensors")?;
-    let choice_tensors = if description.choice.is_some() { 2 } else { 0 };
+    let choice_tensors = usize::from(description.choice.is_some());
     let expected = 2 + 2 * LAYERS.len() + choice_tensors;
     ensure!(
         tensors.len() == expected,
@@ -95,21 +89,14 @@ pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Option<Choice>, Descript
     }
     let layers: [Layer; 3] =
         layers.try_into().ok().context("verifier file: expected three layers")?;
-    let choice = description.choice.as_ref();
-    let choice = choice.map(|choice| read_choice(&tensors, &choice.instructions)).transpose()?;
+    let choice = match &description.choice {
+        Some(_) => {
+            let weights = read(&tensors, CHOICE, &[FEATURES])?;
+            Some(Choice::new(weights.try_into().expect("one per feature"))?)
+        }
+        None => None,
+    };
     Ok((Network::new(standardisation, layers)?, choice, description))
-}
-
-fn read_choice(tensors: &SafeTensors<'_>, instructions: &[String]) -> anyhow::Result<Choice> {
-    ensure!(
-        instructions.is_sorted_by(|a, b| a < b),
-        "choice instructions: expected each once and in order, got {instructions:?}"
-    );
-    let shared = read(tensors, CHOICE, &[FEATURES])?;
-    let rows = read(tensors, CHOICE_INSTRUCTIONS, &[instructions.len(), DEVIATIONS])?;
-    let rows = rows.chunks_exact(DEVIATIONS).map(|row| row.try_into().expect("a whole row"));
-    let shared = shared.try_into().expect("as many as features");
-    Choice { shared, instructions: instructions.iter().cloned().zip(rows).collect() }.checked()
 }
 
 /// SHA-256 in hexadecimal.

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! last hidden states ─▶ mean ─▶ network (equation 4): how promising the situation is ─┐
-//! actions ─▶ deviations from the siblings ─▶ choice: which candidate is better ───────┴▶ logit of each
+//! log-probabilities, actions ─▶ against the siblings ─▶ choice: which is better ──────┴▶ logit of each
 //! ```
 
 mod choice;
@@ -15,9 +15,7 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 
-use crate::strategy::CandidateAction;
-
-pub use choice::{Choice, DEVIATIONS, FEATURES, Features, features};
+pub use choice::{Choice, FEATURES, Features, Sibling, features};
 pub use description::{ChoiceEvidence, Description, Evidence, Gain, Options};
 pub use metrics::{Discrimination, HeldOut, Metrics, weighted_loss};
 pub use network::{Layer, Network, Standardisation};
@@ -33,12 +31,10 @@ const LOGITS_PER_PROBABILITY: f32 = 4.0;
 pub struct Siblings<'a> {
     /// Each candidate's last hidden state.
     pub hidden: &'a [&'a [f32]],
-    /// What each would do; `None` is a malformed one.
-    pub actions: &'a [Option<CandidateAction>],
-    /// What the robot was told.
-    pub instruction: &'a str,
+    /// What tells it from the others; `None` is a malformed one.
+    pub candidates: &'a [Option<Sibling>],
     /// One unit of each number of an action.
-    pub action_scale: &'a [f32; DEVIATIONS],
+    pub action_scale: &'a [f32; 7],
 }
 
 /// A trained verifier for one policy.
@@ -116,20 +112,19 @@ impl Verifier {
     /// mean hidden state, so that it cannot prefer the candidate that merely claims more progress, and the choice part
     /// tells the candidates apart. A malformed candidate's logit means nothing.
     pub fn logits(&self, siblings: &Siblings<'_>) -> Vec<f32> {
-        let Siblings { hidden, actions, instruction, action_scale } = siblings;
-        assert_eq!(hidden.len(), actions.len(), "one action per hidden state");
+        let Siblings { hidden, candidates, action_scale } = siblings;
+        assert_eq!(hidden.len(), candidates.len(), "one hidden state per candidate");
         let Some(choice) = &self.choice else {
             return hidden.iter().map(|row| self.network.logit(row)).collect();
         };
-        let well_formed = hidden.iter().zip(*actions).filter(|(_, action)| action.is_some());
+        let well_formed = hidden.iter().zip(*candidates).filter(|(_, one)| one.is_some());
         let rows: Vec<&[f32]> = well_formed.map(|(row, _)| *row).collect();
         let situation = self.network.logit(&mean_hidden(&rows, self.network.input_size()));
         let logit = |features: Option<Features>| {
-            let advantage =
-                features.map_or(0.0, |features| choice.advantage(instruction, &features));
+            let advantage = features.map_or(0.0, |features| choice.advantage(&features));
             situation + LOGITS_PER_PROBABILITY * advantage
         };
-        features(actions, action_scale).into_iter().map(logit).collect()
+        features(candidates, action_scale).into_iter().map(logit).collect()
     }
 }
 
@@ -151,6 +146,7 @@ pub fn probability(logit: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::strategy::CandidateAction;
     use rand::{Rng, SeedableRng, rngs::StdRng};
 
     /// A verifier with arbitrary weights: 5 inputs, hidden layers of 4 and 3.
@@ -179,61 +175,49 @@ mod tests {
         Verifier::new(&network, None, &description).expect("a whole verifier")
     }
 
-    /// The same with weights that prefer what deviates towards +x, doubly so when told to push.
+    /// The same with weights that prefer what the policy was surer of.
     fn choosing(seed: u64) -> Verifier {
         let plain = arbitrary(seed);
-        let mut shared = [0.0; FEATURES];
-        shared[0] = 0.25;
-        let push = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-        let choice = Choice { shared, instructions: [("push".to_owned(), push)].into() };
-        let evidence =
-            ChoiceEvidence { instructions: vec!["push".to_owned()], ..made_up_evidence() };
+        let mut weights = [0.0; FEATURES];
+        weights[0] = 0.25;
+        let choice = Choice::new(weights).expect("finite");
+        let gain = Gain { points: 1.0, standard_error: 0.5 };
+        let (gain, medoid_gain) = (gain.clone(), gain);
+        let evidence = ChoiceEvidence { episodes: 2, decisions: 20, gain, medoid_gain };
         let description = Description { choice: Some(evidence), ..plain.description.clone() };
         Verifier::new(&plain.network, Some(&choice), &description).expect("a whole verifier")
     }
 
-    fn made_up_evidence() -> ChoiceEvidence {
-        let gain = Gain { points: 1.0, standard_error: 0.5 };
-        ChoiceEvidence {
-            instructions: Vec::new(),
-            episodes: 2,
-            decisions: 20,
-            gain: gain.clone(),
-            medoid_gain: gain,
-        }
+    /// A candidate that differs from others in the log-probability of its first part.
+    fn sure(log_probability: f32) -> Option<Sibling> {
+        let action = CandidateAction { tokens: [500; 7], action: [0.0; 7] };
+        let mut confidence = [0.0; crate::policy::PARTS];
+        confidence[0] = log_probability;
+        Some(Sibling { action, confidence })
     }
 
-    /// Logits of hidden states whose candidates all do the same.
+    /// Logits of hidden states whose candidates are alike.
     fn alike(verifier: &Verifier, hidden: &[&[f32]]) -> Vec<f32> {
-        let actions = vec![acting(0.0); hidden.len()];
-        let siblings =
-            Siblings { hidden, actions: &actions, instruction: "push", action_scale: &[1.0; 7] };
-        verifier.logits(&siblings)
-    }
-
-    fn acting(x: f32) -> Option<CandidateAction> {
-        Some(CandidateAction { tokens: [500; 7], action: [x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] })
+        let candidates = vec![sure(-1.0); hidden.len()];
+        verifier.logits(&Siblings { hidden, candidates: &candidates, action_scale: &[1.0; 7] })
     }
 
     #[test]
-    fn the_choice_part_ranks_by_action_and_the_situation_by_the_mean() {
+    fn the_choice_part_ranks_and_the_situation_is_that_of_the_mean() {
         let verifier = choosing(1);
         let rows: [&[f32]; 3] = [&[0.1; 5], &[9.0; 5], &[0.5; 5]];
         // The second is malformed: its hidden state must not count.
-        let actions = [acting(-1.0), None, acting(1.0)];
-        let logits = |instruction| {
-            let siblings =
-                Siblings { hidden: &rows, actions: &actions, instruction, action_scale: &[2.0; 7] };
-            verifier.logits(&siblings)
-        };
+        let candidates = [sure(-2.0), None, sure(-1.0)];
+        let logits = verifier.logits(&Siblings {
+            hidden: &rows,
+            candidates: &candidates,
+            action_scale: &[1.0; 7],
+        });
         let situation = verifier.network.logit(&[0.3; 5]);
-        let near = |found: f32, expected: f32| (found - expected).abs() < 1e-5;
-        // Half a unit off the mean: 4 logits per probability x 0.25 x 0.5.
-        let pull = logits("pull");
-        assert!(near(pull[0], situation - 0.5) && near(pull[2], situation + 0.5), "{pull:?}");
-        let push = logits("push");
-        assert!(near(push[0], situation - 1.5) && near(push[2], situation + 1.5), "{push:?}");
-        assert_eq!(push[1], situation);
+        // Half a nat off the mean: 4 logits per probability x 0.25 x 0.5.
+        for (found, expected) in logits.iter().zip([situation - 0.5, situation, situation + 0.5]) {
+            assert!((found - expected).abs() < 1e-5, "{logits:?} around {situation}");
+        }
     }
 
     #[test]
