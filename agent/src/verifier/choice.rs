@@ -5,6 +5,8 @@
 //! of the action, and how far the action is from those of its siblings. It is linear, because one action changes an
 //! episode's outcome by little and only few numbers can be learnt from that.
 
+use std::ops::Range;
+
 use anyhow::ensure;
 
 use crate::policy::{Confidence, PARTS};
@@ -14,6 +16,9 @@ use crate::strategy::{CandidateAction, distance_mean};
 const NUMBERS: usize = 7;
 /// Log-probabilities of the parts, sizes of the deviations, and the nearness to the siblings.
 pub const FEATURES: usize = PARTS + NUMBERS + 1;
+
+/// Features of which more is never better: the sizes of the deviations. Of all others less is never better.
+pub const PENALTIES: Range<usize> = PARTS..PARTS + NUMBERS;
 
 /// How one candidate differs from its siblings; every feature's mean over the siblings is 0.
 pub type Features = [f32; FEATURES];

@@ -15,7 +15,7 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 
-pub use choice::{Choice, FEATURES, Features, Sibling, features};
+pub use choice::{Choice, FEATURES, Features, PENALTIES, Sibling, features};
 pub use description::{ChoiceEvidence, Description, Evidence, Gain, Options};
 pub use metrics::{Discrimination, HeldOut, Metrics, weighted_loss};
 pub use network::{Layer, Network, Standardisation};
