@@ -9,8 +9,9 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 
+use super::decision::DecisionSample;
 use super::learner::{Learner, Samples};
-use super::set::{DecisionSample, LabelledEpisode};
+use super::set::LabelledEpisode;
 use crate::verifier::{Network, Standardisation};
 
 /// Parts of the episodes, of which each is valued by a critic that was fitted to the others.

@@ -7,6 +7,7 @@
 
 mod advantage;
 mod choice;
+mod decision;
 mod learner;
 pub mod records;
 mod set;
@@ -17,7 +18,8 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 
-pub use set::{DecisionSample, LabelledEpisode, STATISTICS, Split, TrainingSet};
+pub use decision::{DecisionSample, STATISTICS};
+pub use set::{LabelledEpisode, Split, TrainingSet};
 
 use crate::verifier::{
     Description, Evidence, HeldOut, Metrics, Network, Options, Standardisation, Verifier,

@@ -7,14 +7,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail, ensure};
 use protocol::{EpisodeOutcome, Statistics};
 
-use super::{DecisionSample, LabelledEpisode, STATISTICS};
+use super::{LabelledEpisode, decision};
 use crate::labels::{LabelStore, outcome};
 use crate::policy::Confidence;
-use crate::record::{CandidateRecord, EpisodeRecord, StepRecord, hidden_from_bytes};
+use crate::record::{EpisodeRecord, hidden_from_bytes};
 use crate::run::{record_path, recorded};
-use crate::strategy::{CandidateAction, Strategy};
+use crate::strategy::Strategy;
 use crate::suite::SeedRange;
-use crate::verifier::{Sibling, features, mean_hidden};
 
 /// What records are read for.
 #[derive(Clone, Copy)]
@@ -186,7 +185,7 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
         hidden.extend(hidden_from_bytes(bytes).with_context(|| format!("step {index}"))?);
         steps.push(index);
         if let Some(list) = &mut decisions {
-            match decision(step, before, reader).with_context(|| format!("step {index}"))? {
+            match decision::read(step, before, reader).with_context(|| format!("step {index}"))? {
                 Some(sample) => list.push(sample),
                 None => decisions = None,
             }
@@ -203,79 +202,6 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
     })
 }
 
-/// What a step's decision was between; none when hidden states of well-formed candidates were not kept.
-fn decision(
-    step: &StepRecord,
-    before: Statistics,
-    reader: Reader<'_>,
-) -> anyhow::Result<Option<DecisionSample>> {
-    let siblings = step.candidates.iter().map(|candidate| sibling(candidate, reader));
-    let siblings = siblings.collect::<anyhow::Result<Vec<_>>>()?;
-    let well_formed = step.candidates.iter().filter(|candidate| candidate.action.is_some());
-    let Some(bytes) = well_formed.map(|one| one.hidden.as_ref()).collect::<Option<Vec<_>>>() else {
-        return Ok(None);
-    };
-    let rows = bytes.into_iter().map(|bytes| hidden_from_bytes(bytes));
-    let rows = rows.collect::<anyhow::Result<Vec<Vec<f32>>>>()?;
-    let size = rows.first().map_or(0, Vec::len);
-    ensure!(
-        rows.iter().all(|row| row.len() == size),
-        "expected hidden states of one size, got several"
-    );
-    let rows: Vec<&[f32]> = rows.iter().map(Vec::as_slice).collect();
-    let candidates = features(&siblings, reader.action_scale).into_iter().flatten().collect();
-    Ok(Some(DecisionSample {
-        hidden_mean: mean_hidden(&rows, size),
-        statistics: flags(before),
-        candidates,
-    }))
-}
-
-/// The candidate beside others; none when it is malformed.
-fn sibling(candidate: &CandidateRecord, reader: Reader<'_>) -> anyhow::Result<Option<Sibling>> {
-    let CandidateRecord { tokens, log_probabilities, action, .. } = candidate;
-    let Some(action) = *action else { return Ok(None) };
-    let action_tokens = tokens.last_chunk();
-    let action_tokens = action_tokens.filter(|_| tokens.len() == log_probabilities.len());
-    let action_tokens = action_tokens.with_context(|| {
-        format!(
-            "expected at least 7 tokens with as many log-probabilities, got {} and {}",
-            tokens.len(),
-            log_probabilities.len()
-        )
-    })?;
-    Ok(Some(Sibling {
-        action: CandidateAction { tokens: *action_tokens, action },
-        confidence: (reader.confidence)(tokens, log_probabilities),
-    }))
-}
-
-fn flags(statistics: Statistics) -> [f32; STATISTICS] {
-    let Statistics {
-        is_success,
-        is_grasped,
-        ever_grasped,
-        consecutive_grasp,
-        moved_correct_object,
-        moved_wrong_object,
-        source_on_target,
-        ever_success,
-        released_success,
-    } = statistics;
-    let flags = [
-        is_success,
-        is_grasped,
-        ever_grasped,
-        consecutive_grasp,
-        moved_correct_object,
-        moved_wrong_object,
-        source_on_target,
-        ever_success,
-        released_success,
-    ];
-    flags.map(|flag| f32::from(u8::from(flag)))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -284,6 +210,7 @@ mod tests {
     use crate::record::{
         CandidateRecord, EpisodeIdentity, RECORD_VERSION, StepRecord, Versions, hidden_to_bytes,
     };
+    use crate::training::STATISTICS;
     use protocol::Statistics;
 
     /// The first part's confidence is the first token's log-probability.

@@ -7,7 +7,7 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 
-use crate::verifier::Features;
+use super::decision::DecisionSample;
 
 /// One finished episode as the verifier sees it.
 #[derive(Clone, Debug, PartialEq)]
@@ -27,20 +27,6 @@ pub struct LabelledEpisode {
     /// What the decision of each sample was between; none unless the executed candidates were drawn, not chosen.
     pub decisions: Option<Vec<DecisionSample>>,
 }
-
-/// One decision.
-#[derive(Clone, Debug, PartialEq)]
-pub struct DecisionSample {
-    /// Mean hidden state of the well-formed candidates.
-    pub hidden_mean: Vec<f32>,
-    /// What the simulator had said after the step before, as 0 or 1; the verifier never sees it.
-    pub statistics: [f32; STATISTICS],
-    /// How each well-formed candidate differs from the others; the first was executed.
-    pub candidates: Vec<Features>,
-}
-
-/// Flags of [`protocol::Statistics`].
-pub const STATISTICS: usize = 9;
 
 /// Episodes to train on, all of one policy.
 #[derive(Clone, Debug)]

@@ -3,7 +3,8 @@
 use anyhow::Result;
 use candle_core::D;
 
-use super::super::{Proposal, ProposalRequest};
+use super::super::reasoning::TAGS;
+use super::super::{Candidate, PARTS, Proposal, ProposalRequest};
 use super::*;
 
 const INSTRUCTION: &str = "Put the spoon on the towel";
@@ -169,6 +170,41 @@ fn log_probabilities_are_those_of_temperature_one() -> Result<()> {
         }
     }
     Ok(())
+}
+
+#[test]
+fn confidence_is_the_sum_over_each_tags_text_and_each_action_number() -> Result<()> {
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/bridge-small");
+    for policy in [Policy::load(&shipped)?, tiny("tiny", Backend::Kernels)?] {
+        let image = image(6, policy.image_size().0);
+        let proposal = policy.propose(&[request(&image, 8, 1.0, 4)])?.remove(0);
+        for Candidate { tokens, log_probabilities, .. } in proposal.candidates {
+            let (mut expected, mut actions) = ([0.0; PARTS], TAGS.len());
+            for (index, log_probability) in log_probabilities.iter().enumerate() {
+                let part = if policy.bins.contains(tokens[index]) {
+                    actions += 1;
+                    (actions - 1).min(PARTS - 1)
+                } else {
+                    section(&policy.decode_text(&tokens[..=index]))
+                };
+                expected[part] += log_probability.max(-8.0);
+            }
+            assert_eq!(policy.confidence(&tokens, &log_probabilities), expected);
+        }
+    }
+    Ok(())
+}
+
+/// The tag in whose text the end lies, found the slow way.
+fn section(text: &str) -> usize {
+    let ends = |at: usize, tag: &str| {
+        let begins = at == 0 || text[..at].ends_with(char::is_whitespace);
+        begins && text[at..].starts_with(tag)
+    };
+    let last =
+        |tag: &&str| (0..text.len()).rev().find(|at| text.is_char_boundary(*at) && ends(*at, tag));
+    let found = TAGS.iter().enumerate().filter_map(|(index, tag)| Some((last(tag)?, index)));
+    found.max().map_or(0, |(_, index)| index)
 }
 
 #[test]
