@@ -256,16 +256,17 @@ impl Campaign {
 
     fn report(&self, folder: &Path, plans: &[EpisodePlan], was_stopped: bool) -> Result<Report> {
         let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
-        let mut versions = header.versions;
+        let mut versions = header.versions.clone();
         let simulator = summaries.first().map(|summary| summary.simulator.as_str());
         versions["simulator"] = json!(simulator);
-        let planned = plans.len() * self.arms.len();
+        // The run may hold arms that this campaign did not ask for.
+        let missing = Queue::new(&header.run, plans, &self.arms, &run::recorded(folder)?).len();
         Ok(Report {
             folder: folder.to_path_buf(),
             results: Results::new(&summaries, &run::faults(folder)?)?,
             versions,
-            missing: planned.saturating_sub(summaries.len()),
-            planned,
+            missing,
+            planned: plans.len() * self.arms.len(),
             was_stopped,
         })
     }

@@ -1,7 +1,7 @@
 //! A run is a folder: its options and versions, one record per finished episode, an index, a lock.
 //!
 //! ```text
-//! run.json            what was asked for, with which versions; a second start must ask for the same
+//! run.json            what was asked for, with which versions; a second start may only ask for more of the same
 //! episodes/{id}.msgpack   the truth: one whole file per finished episode
 //! index.sqlite        a summary of every record; rebuilt wherever it disagrees with the folder
 //! faults.jsonl        one line per attempt that broke; never a label
@@ -9,6 +9,7 @@
 //! lock                held by the one process that writes
 //! ```
 
+mod header;
 mod index;
 
 use std::collections::BTreeSet;
@@ -16,30 +17,19 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, bail};
 use protocol::Statistics;
 use rusqlite::Connection;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::record::{EpisodeIdentity, EpisodeRecord, write_whole};
+pub use header::{RunHeader, read_header};
+
+use crate::record::{EpisodeIdentity, EpisodeRecord};
 
 const EPISODES: &str = "episodes";
 const FAULTS: &str = "faults.jsonl";
-const HEADER: &str = "run.json";
 const RECORD_SUFFIX: &str = ".msgpack";
-
-/// The file `run.json`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RunHeader {
-    /// The run's name everywhere: in records, labels and zenoh keys.
-    pub run: String,
-    /// Everything that decides the results, by name.
-    pub options: Value,
-    /// Versions at the start, by name.
-    pub versions: Value,
-}
 
 /// A run that this process may write.
 #[derive(Debug)]
@@ -91,25 +81,14 @@ pub struct FaultRecord {
 }
 
 impl Run {
-    /// Starts a run in `folder`, or goes on with the one that is there when it has the same options and versions.
+    /// Starts a run in `folder`, or goes on with the one that is there when it has the same options and versions;
+    /// more arms and more episodes are added to it.
     pub fn open(folder: &Path, options: Value, versions: Value) -> Result<Run> {
         let name = folder.display();
         std::fs::create_dir_all(folder.join(EPISODES))
             .with_context(|| format!("cannot make the run {name}"))?;
         let lock = lock(folder)?;
-        let path = folder.join(HEADER);
-        let header = if path.exists() {
-            let header = read_header(folder)?;
-            ensure_same("option", &header.options, &options)
-                .with_context(|| format!("the run {name} exists"))?;
-            ensure_same("version", &header.versions, &versions)
-                .with_context(|| format!("the run {name} exists"))?;
-            header
-        } else {
-            let header = RunHeader { run: unique_name(folder), options, versions };
-            write_whole(&path, &serde_json::to_vec_pretty(&header)?)?;
-            header
-        };
+        let header = header::settle(folder, options, versions)?;
         sweep(folder)?;
         let index = index::open(folder)?;
         // Labels name records; they must be found from any working folder.
@@ -143,14 +122,6 @@ impl Run {
     pub fn video_path(&self, id: &str) -> PathBuf {
         video_path(&self.folder, id)
     }
-}
-
-/// Reads `run.json`.
-pub fn read_header(folder: &Path) -> Result<RunHeader> {
-    let path = folder.join(HEADER);
-    let text = std::fs::read_to_string(&path)
-        .with_context(|| format!("{} is not a run: cannot read {HEADER}", folder.display()))?;
-    serde_json::from_str(&text).with_context(|| format!("{} is not a run's header", path.display()))
 }
 
 /// All recorded episodes of a run that another process may be writing, ordered by name.
@@ -232,33 +203,6 @@ fn lock(folder: &Path) -> Result<File> {
     }
 }
 
-/// The folder's name and eight random digits: runs of the same name in different places must not share labels.
-fn unique_name(folder: &Path) -> String {
-    let name =
-        folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    let allowed = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
-    let name: String =
-        name.chars().map(|letter| if allowed(letter) { letter } else { '_' }).take(48).collect();
-    format!("{name}-{:08x}", rand::random::<u32>())
-}
-
-/// Names the first thing that differs: mixing two sets of options in one table would be worse than stopping.
-fn ensure_same(what: &str, existing: &Value, asked: &Value) -> Result<()> {
-    let (Value::Object(existing), Value::Object(asked)) = (existing, asked) else {
-        bail!("{what}s: expected names and values, got {existing} and {asked}");
-    };
-    let names: BTreeSet<&String> = existing.keys().chain(asked.keys()).collect();
-    for name in names {
-        let (was, is) =
-            (existing.get(name).unwrap_or(&Value::Null), asked.get(name).unwrap_or(&Value::Null));
-        ensure!(
-            was == is,
-            "{what} {name}: it was started with {was}, got {is}; choose another --out for another run"
-        );
-    }
-    Ok(())
-}
-
 /// Removes what a killed process was writing.
 fn sweep(folder: &Path) -> Result<()> {
     for entry in std::fs::read_dir(folder.join(EPISODES))? {
@@ -305,33 +249,6 @@ mod tests {
         assert_eq!(episodes(run.summaries().expect("summaries")), [0, 1]);
         assert_eq!(episodes(summaries(folder.path()).expect("while it is written")), [0, 1]);
         assert_eq!(recorded(folder.path()).expect("names").len(), 2);
-    }
-
-    #[test]
-    fn other_options_and_versions_are_refused_by_name() {
-        let folder = tempfile::tempdir().expect("a folder");
-        drop(open(folder.path()).expect("a run"));
-        let check = |options: Value, versions: Value, expected: &str| {
-            let error = Run::open(folder.path(), options, versions).expect_err(expected);
-            assert!(format!("{error:#}").contains(expected), "{error:#}");
-        };
-        let (options, versions) =
-            (json!({"seed": 1, "arms": ["greedy"]}), json!({"policy": "cafe"}));
-        check(
-            json!({"seed": 2, "arms": ["greedy"]}),
-            versions.clone(),
-            "option seed: it was started with 1, got 2",
-        );
-        check(
-            json!({"seed": 1}),
-            versions,
-            "option arms: it was started with [\"greedy\"], got null",
-        );
-        check(
-            options,
-            json!({"policy": "beef"}),
-            "version policy: it was started with \"cafe\", got \"beef\"",
-        );
     }
 
     #[test]
