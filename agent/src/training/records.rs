@@ -185,9 +185,10 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
         hidden.extend(hidden_from_bytes(bytes).with_context(|| format!("step {index}"))?);
         steps.push(index);
         if let Some(list) = &mut decisions {
-            match decision::read(step, before, reader).with_context(|| format!("step {index}"))? {
-                Some(sample) => list.push(sample),
-                None => decisions = None,
+            let sample = decision::read(step, before, reader);
+            match sample.with_context(|| format!("step {index}"))? {
+                Some(sample) if chosen == 0 => list.push(sample),
+                _ => decisions = None,
             }
         }
     }
