@@ -107,7 +107,7 @@ fn candidate(
     speech: Speech,
     phrases: &mut Phrases,
 ) -> anyhow::Result<Candidate> {
-    let score = record.score.map(|score| rounded(score, 4));
+    let score = record.score.map(|score| rounded(score, 6));
     let log = rounded(record.log_probability, 2);
     let Some(action) = record.action else {
         let reason = record.malformed.clone().context("a malformed candidate has a reason")?;

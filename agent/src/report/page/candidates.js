@@ -23,7 +23,15 @@ function sections(candidate, phrases) {
   return [task, plan, objects, subtaskReasoning, subtask, moveReasoning, move, gripper];
 }
 
-function candidateHead(candidate, index, isChosen) {
+// How far a score is below the best of its siblings: one decision changes little, so that three digits would look alike.
+function standing(candidate, candidates) {
+  const scores = candidates.filter((one) => one.malformed === undefined && one.score !== null).map((one) => one.score);
+  if (scores.length < 2 || candidate.malformed !== undefined) return "";
+  const best = Math.max(...scores);
+  return candidate.score === best ? " (best)" : ` (${decimal(100 * (candidate.score - best), 3)} points)`;
+}
+
+function candidateHead(candidate, index, isChosen, candidates) {
   const head = element("div", "candidate-head");
   head.append(element("span", "name", `candidate ${index + 1}`));
   if (isChosen) head.append(element("span", "tag chosen", "executed"));
@@ -36,7 +44,7 @@ function candidateHead(candidate, index, isChosen) {
   } else {
     bar.style.visibility = "hidden";
   }
-  const score = candidate.score === null ? "" : `score ${decimal(candidate.score, 3)}  `;
+  const score = candidate.score === null ? "" : `score ${decimal(candidate.score, 3)}${standing(candidate, candidates)}  `;
   head.append(bar, element("span", "right", `${score}log p ${decimal(candidate.log, 1)}`));
   return head;
 }
@@ -74,7 +82,7 @@ function candidateCards(step, phrases, shown, show) {
     const card = element("article", "candidate");
     card.classList.toggle("shown", index === shown);
     card.classList.toggle("chosen-card", isChosen);
-    card.append(candidateHead(candidate, index, isChosen));
+    card.append(candidateHead(candidate, index, isChosen, step.candidates));
     if (candidate.malformed !== undefined) {
       card.classList.add("malformed");
       card.append(element("div", "note", phrases[candidate.malformed]));
