@@ -256,11 +256,11 @@ impl Campaign {
 
     fn report(&self, folder: &Path, plans: &[EpisodePlan], was_stopped: bool) -> Result<Report> {
         let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
-        let mut versions = header.versions.clone();
-        let simulator = summaries.first().map(|summary| summary.simulator.as_str());
-        versions["simulator"] = json!(simulator);
         // The run may hold arms that this campaign did not ask for.
         let missing = Queue::new(&header.run, plans, &self.arms, &run::recorded(folder)?).len();
+        let mut versions = header.versions;
+        let simulator = summaries.first().map(|summary| summary.simulator.as_str());
+        versions["simulator"] = json!(simulator);
         Ok(Report {
             folder: folder.to_path_buf(),
             results: Results::new(&summaries, &run::faults(folder)?)?,

@@ -160,17 +160,25 @@ impl EpisodeRecord {
         let name = path.display();
         let bytes =
             std::fs::read(path).with_context(|| format!("cannot read the record {name}"))?;
-        let mut rest = bytes.as_slice();
-        let record: EpisodeRecord = rmp_serde::from_read(&mut rest)
+        // The version comes first: a record of another one may lack what this one has.
+        let Versioned { version } = rmp_serde::from_slice(&bytes)
             .with_context(|| format!("{name} is not an episode record"))?;
-        ensure!(rest.is_empty(), "{name}: expected one record, got {} bytes after it", rest.len());
-        let version = record.version;
         ensure!(
             version == RECORD_VERSION,
             "{name}: expected record version {RECORD_VERSION}, got {version}"
         );
+        let mut rest = bytes.as_slice();
+        let record: EpisodeRecord = rmp_serde::from_read(&mut rest)
+            .with_context(|| format!("{name} is not an episode record"))?;
+        ensure!(rest.is_empty(), "{name}: expected one record, got {} bytes after it", rest.len());
         Ok(record)
     }
+}
+
+/// What records of all versions have.
+#[derive(Deserialize)]
+struct Versioned {
+    version: u32,
 }
 
 /// A hidden state as it stands in a record.
@@ -297,6 +305,9 @@ pub(crate) mod tests {
         check(&[&bytes[..], &[0]].concat(), "expected one record, got 1 bytes after it");
         let later = EpisodeRecord { version: 3, ..made_up(0) };
         check(&rmp_serde::to_vec_named(&later).expect("bytes"), "expected record version 2, got 3");
+        // A record of the first version, which had no log-probabilities of tokens.
+        let first = serde_json::json!({"version": 1, "steps": [{"log_probability": -3.5}]});
+        check(&rmp_serde::to_vec_named(&first).expect("bytes"), "expected record version 2, got 1");
     }
 
     #[test]

@@ -55,15 +55,9 @@ impl Lanes {
             completions.iter_mut().for_each(|completion| completion.session += start);
             Ok(completions)
         };
+        let run = &run;
         let parts = thread::scope(|scope| {
-            let threads: Vec<_> = (0..lanes)
-                .map(|lane| {
-                    scope.spawn({
-                        let run = &run;
-                        move || run(lane)
-                    })
-                })
-                .collect();
+            let threads: Vec<_> = (0..lanes).map(|lane| scope.spawn(move || run(lane))).collect();
             let join = |thread: thread::ScopedJoinHandle<'_, _>| {
                 thread.join().unwrap_or_else(|_| Err(anyhow!("a lane of the policy panicked")))
             };

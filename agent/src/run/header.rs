@@ -59,9 +59,11 @@ pub fn settle(folder: &Path, options: Value, versions: Value) -> Result<RunHeade
 fn grow(noted: &mut Value, asked: &Value) -> bool {
     let mut grown = false;
     if let (Some(noted), Some(asked)) = (noted["arms"].as_array_mut(), asked["arms"].as_array()) {
-        for arm in asked.iter().filter(|arm| !noted.contains(arm)).cloned().collect::<Vec<_>>() {
-            noted.push(arm);
-            grown = true;
+        for arm in asked {
+            if !noted.contains(arm) {
+                noted.push(arm.clone());
+                grown = true;
+            }
         }
     }
     if asked["episodes"].as_u64() > noted["episodes"].as_u64() {

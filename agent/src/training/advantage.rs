@@ -11,6 +11,7 @@ use rand::seq::SliceRandom;
 
 use super::decision::DecisionSample;
 use super::learner::{Learner, Samples};
+use super::pass;
 use super::set::LabelledEpisode;
 use crate::verifier::{Network, Standardisation};
 
@@ -135,9 +136,7 @@ impl Critic {
         for _ in 0..EPOCHS {
             let mut order: Vec<u32> = (0..labels.len() as u32).collect();
             order.shuffle(&mut random);
-            for batch in order.chunks(BATCH_SAMPLES) {
-                optimizer.backward_step(&learner.loss(&samples, batch)?)?;
-            }
+            pass(&learner, &mut optimizer, &samples, &order, BATCH_SAMPLES)?;
         }
         Ok(Critic { network: learner.network(&standardisation)? })
     }

@@ -14,7 +14,7 @@ use crate::verifier::{Choice, ChoiceEvidence, FEATURES, Features, Gain, Options,
 const EPISODES_MIN: usize = 20;
 /// A feature that varies less carries nothing.
 const SCALE_MIN: f64 = 1e-6;
-/// Rounds of coordinate descent; some dozens suffice for so few weights.
+/// Rounds of coordinate descent: far more than so few weights take to settle, and still only milliseconds.
 const ROUNDS: usize = 1000;
 
 /// The choice part of all episodes with decisions, and what it is worth; none when there are too few of them.

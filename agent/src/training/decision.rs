@@ -69,28 +69,18 @@ fn sibling(candidate: &CandidateRecord, reader: Reader<'_>) -> anyhow::Result<Op
     }))
 }
 
+/// In the order of the wire.
 fn flags(statistics: Statistics) -> [f32; STATISTICS] {
-    let Statistics {
-        is_success,
-        is_grasped,
-        ever_grasped,
-        consecutive_grasp,
-        moved_correct_object,
-        moved_wrong_object,
-        source_on_target,
-        ever_success,
-        released_success,
-    } = statistics;
     let flags = [
-        is_success,
-        is_grasped,
-        ever_grasped,
-        consecutive_grasp,
-        moved_correct_object,
-        moved_wrong_object,
-        source_on_target,
-        ever_success,
-        released_success,
+        statistics.is_success,
+        statistics.is_grasped,
+        statistics.ever_grasped,
+        statistics.consecutive_grasp,
+        statistics.moved_correct_object,
+        statistics.moved_wrong_object,
+        statistics.source_on_target,
+        statistics.ever_success,
+        statistics.released_success,
     ];
     flags.map(|flag| f32::from(u8::from(flag)))
 }

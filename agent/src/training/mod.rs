@@ -182,7 +182,8 @@ fn pass(
     Ok(sum / order.len() as f64)
 }
 
-/// Scores held-out episodes with the arithmetic that will choose candidates, not with the tensors that were trained.
+/// Scores the executed candidates of held-out episodes with the network's plain loops, not with the tensors that were
+/// trained. The choice part tells siblings apart, of which only one was executed, so that it has no place in these figures.
 fn score(set: &TrainingSet, episodes: &[usize], network: &Network) -> HeldOut {
     let mut held_out = HeldOut::default();
     for episode in episodes.iter().map(|episode| &set.episodes()[*episode]) {

@@ -16,7 +16,7 @@ pub struct Description {
     pub options: Options,
     /// What it was trained on.
     pub evidence: Evidence,
-    /// How well it separates successes from failures on the held-out episodes.
+    /// How well its network separates successes from failures on the held-out episodes, by executed candidates.
     pub held_out: Metrics,
     /// What its choice part was trained on; none when it has none.
     #[serde(default)]
