@@ -343,7 +343,7 @@ async fn outcomes_reach_those_who_come_early_and_those_who_come_late() {
         while !missing.is_empty() {
             let next = tokio::time::timeout(WAIT, subscriber.next())
                 .await
-                .expect("in time")
+                .unwrap_or_else(|_| panic!("in time: still missing {missing:?}"))
                 .expect("an outcome");
             assert_eq!(next, outcome("run-1", next.episode));
             missing.remove(&next.episode);

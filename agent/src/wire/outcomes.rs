@@ -1,12 +1,16 @@
 //! The stream of episode outcomes, with a cache at its source for those who come late or miss some.
 
+use std::collections::BTreeSet;
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use protocol::{EpisodeOutcome, decode, encode};
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
+use zenoh::Session;
 use zenoh::qos::{CongestionControl, Reliability};
+use zenoh::query::{ConsolidationMode, QueryTarget, ReplyKeyExpr};
 use zenoh::sample::Sample;
 use zenoh_ext::{
     AdvancedPublisher, AdvancedPublisherBuilderExt, AdvancedSubscriber,
@@ -77,10 +81,14 @@ impl OutcomeSubscriber {
         let key =
             run.map_or_else(|| Ok(network.keys.outcomes()), |run| network.keys.outcome(run))?;
         let (sender, outcomes) = mpsc::channel(UNREAD_MAX);
+        let beginnings = Beginnings { session: network.session.clone(), known: Mutex::default() };
         let subscriber = network
             .session
             .declare_subscriber(key)
-            .callback(move |sample| receive(&sender, &sample))
+            .callback(move |sample| {
+                beginnings.fetch(&sample, &sender);
+                receive(&sender, &sample);
+            })
             .history(HistoryConfig::default().detect_late_publishers())
             .recovery(RecoveryConfig::default().heartbeat())
             .await
@@ -91,6 +99,45 @@ impl OutcomeSubscriber {
     /// The next outcome.
     pub async fn next(&mut self) -> anyhow::Result<EpisodeOutcome> {
         self.outcomes.recv().await.context("the network is closed")
+    }
+}
+
+/// Fetches what a publisher sent before it knew of the subscriber.
+///
+/// zenoh-ext takes the first sample that it sees of a new publisher for the publisher's first, and
+/// then drops the earlier ones as repetitions when the cache brings them.
+struct Beginnings {
+    session: Session,
+    /// Publishers of which a sample came.
+    known: Mutex<BTreeSet<(String, u32)>>,
+}
+
+impl Beginnings {
+    /// Asks for all that came before `sample`, if it is the first one of its publisher.
+    fn fetch(&self, sample: &Sample, sender: &mpsc::Sender<EpisodeOutcome>) {
+        let Some(source) = sample.source_info() else { return };
+        let publisher = (source.source_id().zid().to_string(), source.source_id().eid());
+        let (zid, eid) = &publisher;
+        let cache = format!("{}/@adv/*/{zid}/{eid}/**", sample.key_expr());
+        let is_new =
+            self.known.lock().unwrap_or_else(PoisonError::into_inner).insert(publisher.clone());
+        let Some(last) = source.source_sn().checked_sub(1).filter(|_| is_new) else { return };
+        let sender = sender.clone();
+        let asked = zenoh::Wait::wait(
+            self.session
+                .get(format!("{cache}?_sn=0..{last}"))
+                .callback(move |reply| {
+                    if let Ok(sample) = reply.result() {
+                        receive(&sender, sample);
+                    }
+                })
+                .consolidation(ConsolidationMode::None)
+                .accept_replies(ReplyKeyExpr::Any)
+                .target(QueryTarget::All),
+        );
+        if let Err(error) = asked {
+            tracing::warn!(%error, "the first outcomes of {} may be missing", sample.key_expr());
+        }
     }
 }
 
