@@ -23,5 +23,8 @@ mod wire;
 // Evaluations with the models that come with the program: results, kills, faults, the report.
 mod whole_loop;
 
+// What decisions cost.
+mod bench;
+
 // A new verifier while a run goes on.
 mod hot_swap;

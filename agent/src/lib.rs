@@ -48,5 +48,8 @@ pub mod servers;
 pub mod setup;
 pub mod video;
 
+// What it costs.
+pub mod bench;
+
 // The program's subcommands.
 pub mod command;

@@ -1,71 +1,144 @@
-//! `rever bench`: how long decisions take on this machine, by sessions and candidates.
+//! `rever bench`: what the parts of the program cost on this machine.
 
 use std::path::PathBuf;
-use std::time::Instant;
 
-use anyhow::Result;
-use clap::{Args, ValueEnum};
+use anyhow::{Context, Result, ensure};
+use clap::{Args, Subcommand};
+use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::policy::{Image, Policy, ProposalRequest};
+use super::episodes::policy_folder;
+use crate::bench::{DecisionBench, Report, Torch, read_observations};
+use crate::policy::Policy;
+use crate::setup;
+use crate::verifier::Verifier;
 
-const SESSIONS: [usize; 3] = [1, 8, 16];
-const CANDIDATES: [usize; 5] = [1, 2, 5, 8, 16];
-/// Tokens per candidate when parts are timed: the shipped model's reasoning, action and end.
-const TOKENS: usize = 25;
-const INSTRUCTION: &str = "put the spoon on the towel";
-
-/// Time a part of the program.
+/// What the parts of the program cost on this machine.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// What to time
-    what: What,
-    /// Folder of the policy
-    #[arg(long, default_value = "agent/models/bridge-small")]
-    policy: PathBuf,
-    /// Runs of each cell, of which the fastest counts
-    #[arg(long, default_value_t = 5)]
-    repeats: usize,
+    #[command(subcommand)]
+    part: Part,
 }
 
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum What {
-    /// One decision: image and prompt, then every token of every candidate
-    Decision,
+#[derive(Debug, Subcommand)]
+enum Part {
+    Decision(DecisionArguments),
 }
 
-/// Prints one line per number of sessions and candidates.
+/// One decision at a time on recorded observations: prefill, decode, parse, score, choose
+#[derive(Debug, Args)]
+struct DecisionArguments {
+    /// The checkpoint's folder [default: the one that comes with rever]
+    #[arg(long)]
+    policy: Option<PathBuf>,
+    /// The verifier's file [default: the one beside the policy's weights]
+    #[arg(long)]
+    verifier: Option<PathBuf>,
+    /// Recorded observations: images and instructions [default: eight of the shipped policy's size]
+    #[arg(long, value_name = "FILE")]
+    observations: Option<PathBuf>,
+    /// Passes over all observations
+    #[arg(long, default_value_t = 12)]
+    rounds: usize,
+    /// Make the same decisions in PyTorch, in turns
+    #[arg(long)]
+    compare: bool,
+    /// A Python that has PyTorch, for --compare
+    #[arg(long, value_name = "FILE", default_value = "python3")]
+    python: PathBuf,
+    /// Write the figures into this file, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Times what was asked for and prints a table.
 pub fn run(arguments: Arguments) -> Result<()> {
-    let Arguments { what: What::Decision, policy, repeats } = arguments;
-    let policy = Policy::load(&policy)?;
-    let (height, width) = policy.image_size();
-    let byte = |index: usize| (index % 251) as u8;
-    let image = Image { height, width, pixels: (0..height * width * 3).map(byte).collect() };
-    println!("sessions  candidates  prefill ms  step ms  {TOKENS} tokens ms  sampled decision ms");
-    for sessions in SESSIONS {
-        for candidates in CANDIDATES {
-            let request = |seed| ProposalRequest {
-                image: &image,
-                instruction: INSTRUCTION,
-                candidates,
-                temperature: 1.0,
-                seed,
-            };
-            let requests: Vec<ProposalRequest<'_>> = (0..sessions as u64).map(request).collect();
-            let (mut prefill, mut step) = (f64::INFINITY, f64::INFINITY);
-            let mut decision = f64::INFINITY;
-            for _ in 0..repeats {
-                let timings = policy.time(&requests, TOKENS)?;
-                prefill = prefill.min(timings.prefill_ms);
-                step = step.min(timings.step_ms);
-                let start = Instant::now();
-                policy.propose(&requests)?;
-                decision = decision.min(start.elapsed().as_secs_f64() * 1e3);
-            }
-            let whole = prefill + TOKENS as f64 * step;
-            println!(
-                "{sessions:8}  {candidates:10}  {prefill:10.2}  {step:7.2}  {whole:12.1}  {decision:19.1}"
-            );
-        }
+    let Part::Decision(arguments) = arguments.part;
+    let folder = policy_folder(arguments.policy.as_ref())?;
+    let file = arguments.verifier.unwrap_or_else(|| folder.join("verifier.safetensors"));
+    let policy = Policy::load(&folder)?;
+    let verifier = Verifier::load(&file, policy.digest())?;
+    let recorded = match arguments.observations {
+        Some(file) => file,
+        None => setup::repository()?.join("agent/tests/fixtures/bridge-small.safetensors"),
+    };
+    let observations = read_observations(&recorded)?;
+    let torch = if arguments.compare {
+        let script = setup::repository()?.join("agent/training/bench.py");
+        Some(Torch::start(&arguments.python, &script, &folder, &recorded)?)
+    } else {
+        None
+    };
+    ensure!(arguments.rounds > 0, "rounds: expected at least 1, got 0");
+    let progress = ProgressBar::new(arguments.rounds as u64 + 1);
+    let style = "bench: {pos}/{len} rounds, {eta} left";
+    progress.set_style(ProgressStyle::with_template(style).context("progress line")?);
+    let bench = DecisionBench {
+        policy: &policy,
+        verifier: &verifier,
+        observations: &observations,
+        rounds: arguments.rounds,
+    };
+    let report = bench.run(torch, |round| progress.set_position(round as u64))?;
+    progress.finish_and_clear();
+    if let Some(path) = &arguments.json {
+        let text = serde_json::to_string_pretty(&report)?;
+        std::fs::write(path, text + "\n")
+            .with_context(|| format!("cannot write {}", path.display()))?;
     }
+    print(&report);
     Ok(())
+}
+
+fn print(report: &Report) {
+    println!(
+        "{:>10} {:>5} {:>10} {:>8} {:>7} {:>9} {:>9} {:>9} {:>10}",
+        "candidates",
+        "T",
+        "prefill ms",
+        "step ms",
+        "tokens",
+        "p50 ms",
+        "p95 ms",
+        "tokens/s",
+        "bandwidth"
+    );
+    for row in &report.rows {
+        println!(
+            "{:>10} {:>5} {:>10.2} {:>8.3} {:>7.1} {:>9.1} {:>9.1} {:>9.0} {:>8.0} %",
+            row.setting.candidates,
+            row.setting.temperature,
+            row.prefill_ms,
+            row.step_ms,
+            row.tokens,
+            row.decision_ms_p50,
+            row.decision_ms_p95,
+            row.tokens_per_second,
+            100.0 * row.bandwidth_share,
+        );
+    }
+    let megabytes = report.rows.first().map_or(0.0, |row| row.weight_bytes as f64 / 1e6);
+    println!(
+        "{} decisions each, {} threads; a step reads {megabytes:.1} MB of weights, this machine reads as much at {:.1} GB/s",
+        report.decisions,
+        report.threads,
+        report.bandwidth_bytes_per_second / 1e9,
+    );
+    for one in &report.torch {
+        println!(
+            "PyTorch {:<10} {:>3} candidates: {:>8.1} ms (p50) {:>8.1} ms (p95)",
+            one.setting, one.candidates, one.decision_ms_p50, one.decision_ms_p95
+        );
+    }
+    for why in report.torch_hello.iter().flat_map(|hello| &hello.broken) {
+        println!("PyTorch: {why}");
+    }
+    println!(
+        "ratio_greedy {:.2} (five verified candidates over one greedy one)",
+        report.ratio_greedy
+    );
+    if let (Some(eager), Some(best)) = (report.ratio_eager, report.ratio_best) {
+        println!(
+            "ratio_eager {eager:.2}, ratio_best {best:.2} (PyTorch over rever, five candidates)"
+        );
+    }
 }

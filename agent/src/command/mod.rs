@@ -32,7 +32,6 @@ enum Command {
     Train(train::Arguments),
     Report(report::Arguments),
     Doctor(doctor::Arguments),
-    #[command(hide = true)]
     Bench(bench::Arguments),
 }
 

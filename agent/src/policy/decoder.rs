@@ -86,6 +86,18 @@ impl Decoder {
         self.positions_max
     }
 
+    /// Bytes of the products' weights that a step reads; embeddings and norms are a few kilobytes.
+    pub fn step_bytes(&self) -> usize {
+        let layer = |layer: &Layer| {
+            let Layer { query_key_value, o_proj, gate_up, down_proj, .. } = layer;
+            [query_key_value, o_proj, gate_up, down_proj]
+                .into_iter()
+                .map(Linear::bytes)
+                .sum::<usize>()
+        };
+        self.layers.iter().map(layer).sum::<usize>() + self.lm_head.bytes()
+    }
+
     /// Ids -> (ids, hidden)
     pub fn embed(&self, ids: &[u32]) -> Result<Tensor> {
         let ids = Tensor::new(ids, &self.device)?;

@@ -30,6 +30,14 @@ impl Linear {
         Ok(Linear { form, bias })
     }
 
+    /// Bytes of the weight.
+    pub fn bytes(&self) -> usize {
+        match &self.form {
+            Form::Packed(weight) => weight.bytes(),
+            Form::Tensor(weight) => weight.elem_count() * weight.dtype().size_in_bytes(),
+        }
+    }
+
     /// `rows` x weight + bias.
     pub fn forward(&self, rows: &Tensor) -> Result<Tensor> {
         self.apply(rows, None)

@@ -46,6 +46,11 @@ impl PackedWeight {
         self.outputs
     }
 
+    /// Bytes of the panels.
+    pub fn bytes(&self) -> usize {
+        size_of_val(self.panels.as_slice())
+    }
+
     /// `rows` x weight + `bias` + `residual`, row-major.
     pub fn multiply(
         &self,

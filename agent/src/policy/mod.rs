@@ -196,6 +196,11 @@ impl Policy {
         timings::measure(&self.network, &contexts, candidates, tokens)
     }
 
+    /// Bytes of weights that one token step reads, whatever the number of rows.
+    pub fn step_bytes(&self) -> usize {
+        self.network.decoder.step_bytes()
+    }
+
     /// Tokens that may follow a prompt of so many ids and the image.
     fn tokens_max(&self, prompt_ids: usize) -> usize {
         let side = self.config.towers[0].side();

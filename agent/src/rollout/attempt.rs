@@ -99,16 +99,7 @@ impl Attempt {
 
     /// The verifier's logits of the candidates.
     pub fn score(&self, proposal: &Proposal, policy: &Policy) -> Option<Vec<f32>> {
-        let verifier = self.verifier.as_ref()?;
-        let hidden: Vec<&[f32]> = proposal.candidates.iter().map(|one| &*one.hidden).collect();
-        let sibling = |candidate: &Candidate| {
-            let action = candidate_action(candidate)?;
-            let Candidate { tokens, log_probabilities, .. } = candidate;
-            Some(Sibling { action, confidence: policy.confidence(tokens, log_probabilities) })
-        };
-        let candidates: Vec<Option<Sibling>> = proposal.candidates.iter().map(sibling).collect();
-        let action_scale = &policy.action_scale();
-        Some(verifier.logits(&Siblings { hidden: &hidden, candidates: &candidates, action_scale }))
+        self.verifier.as_ref().map(|verifier| score(verifier, proposal, policy))
     }
 
     /// Chooses a candidate, notes the step, and says what to do.
@@ -199,7 +190,21 @@ pub struct Finished {
     pub episode: Episode,
 }
 
-fn candidate_action(candidate: &Candidate) -> Option<CandidateAction> {
+/// The verifier's logits of a proposal's candidates.
+pub fn score(verifier: &Verifier, proposal: &Proposal, policy: &Policy) -> Vec<f32> {
+    let hidden: Vec<&[f32]> = proposal.candidates.iter().map(|one| &*one.hidden).collect();
+    let sibling = |candidate: &Candidate| {
+        let action = candidate_action(candidate)?;
+        let Candidate { tokens, log_probabilities, .. } = candidate;
+        Some(Sibling { action, confidence: policy.confidence(tokens, log_probabilities) })
+    };
+    let candidates: Vec<Option<Sibling>> = proposal.candidates.iter().map(sibling).collect();
+    let action_scale = &policy.action_scale();
+    verifier.logits(&Siblings { hidden: &hidden, candidates: &candidates, action_scale })
+}
+
+/// What a candidate would do; none when it is malformed.
+pub fn candidate_action(candidate: &Candidate) -> Option<CandidateAction> {
     let parsed = candidate.parsed.as_ref().ok()?;
     Some(CandidateAction { tokens: parsed.action_tokens, action: parsed.action })
 }

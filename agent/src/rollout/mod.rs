@@ -17,7 +17,7 @@ use protocol::{Reset, Transition, VerifierUpdate};
 use tokio::sync::watch;
 use tokio::task::{JoinSet, block_in_place};
 
-pub use attempt::{Keep, Seat};
+pub use attempt::{Keep, Seat, candidate_action, score};
 pub use crew::Crew;
 pub use journal::Journal;
 pub use queue::{ATTEMPTS_MAX, Job, Queue};

@@ -1,0 +1,34 @@
+//! How fast this machine reads as many bytes as a step's weights: from memory, or from a cache that holds them.
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use rayon::prelude::*;
+
+/// Passes of which the fastest counts.
+const PASSES: usize = 40;
+/// Sums side by side: enough that additions do not wait for each other.
+const SUMS: usize = 64;
+
+/// Bytes per second over all threads, the fastest of several passes over a buffer of `bytes`.
+pub fn measure(bytes: usize) -> f64 {
+    let values = vec![1.0_f32; (bytes / size_of::<f32>()).max(SUMS)];
+    let share = values.len().div_ceil(rayon::current_num_threads());
+    let pass = || {
+        let start = Instant::now();
+        values.par_chunks(share).for_each(|values| {
+            black_box(sum(black_box(values)));
+        });
+        start.elapsed().as_secs_f64()
+    };
+    let fastest = (0..PASSES).map(|_| pass()).fold(f64::INFINITY, f64::min);
+    size_of_val(values.as_slice()) as f64 / fastest
+}
+
+fn sum(values: &[f32]) -> f32 {
+    let mut sums = [0.0_f32; SUMS];
+    for values in values.chunks_exact(SUMS) {
+        sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+    }
+    sums.iter().sum()
+}
