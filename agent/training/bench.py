@@ -24,8 +24,8 @@ from torch.nn import functional
 import checkpoint
 from network import Network, rotary_table, rotate
 
-# Room for prompt, image and completion in the caches; a compiled step has one shape.
-POSITIONS = 160
+# Room for a completion in the caches.
+TOKENS_MAX = 48
 
 Cache = tuple[Tensor, Tensor]  # keys and values: (layers, batch, heads, positions, head)
 
@@ -43,8 +43,13 @@ def main() -> None:
     # Every number of candidates is compiled for itself, as fast as it can be.
     dynamo.config.recompile_limit = 64
     # Longer attention and a mask in place of a slice is what lets a step be compiled once.
-    eager = Decoding(policy.network, lambda function: function, fixed=False)
-    compiled = Decoding(policy.network, partial(torch.compile, dynamic=False), fixed=True)
+    # A compiled step has one shape, so caches have room for the longest prompt and a completion.
+    patches = policy.network.config.vision.patches
+    positions = patches + max(prompt.shape[1] for prompt in prompts) + TOKENS_MAX
+    eager = Decoding(policy.network, positions, lambda function: function, fixed=False)
+    compiled = Decoding(
+        policy.network, positions, partial(torch.compile, dynamic=False), fixed=True
+    )
     settings, broken = {}, []
     for name, decoding in (("eager", eager), ("compiled", compiled)):
         try:
@@ -82,16 +87,18 @@ class Decoding:
     def __init__(
         self,
         network: Network,
+        positions: int,
         compile_: Callable[[Callable[..., Tensor]], Callable[..., Tensor]],
         *,
         fixed: bool,
     ) -> None:
         self.network = network
+        self.positions = positions
         self.fixed = fixed
         self.embed = compile_(network.embed)
         self.advance = compile_(self._advance)
         config = network.config.text
-        self.rotary = rotary_table(POSITIONS, config, torch.device("cpu"))
+        self.rotary = rotary_table(positions, config, torch.device("cpu"))
 
     def decide(self, image: Tensor, prompt: Tensor, tokens: Tensor) -> None:
         """image (1, height, width, 3), prompt (1, ids), tokens (candidates, steps)."""
@@ -111,7 +118,7 @@ class Decoding:
     def empty(self, batch: int) -> Cache:
         config = self.network.config.text
         heads, layers = config.num_key_value_heads, config.num_hidden_layers
-        shape = (layers, batch, heads, POSITIONS, config.head_size)
+        shape = (layers, batch, heads, self.positions, config.head_size)
         return torch.zeros(shape), torch.zeros(shape)
 
     def _advance(self, x: Tensor, positions: Tensor, keys: Tensor, values: Tensor) -> Tensor:
@@ -121,7 +128,7 @@ class Decoding:
         cosine, sine = (table[positions] for table in self.rotary)
         batch, new, width = x.shape
         shape = (batch, new, -1, config.head_size)
-        seen = POSITIONS if self.fixed else int(positions[-1]) + 1
+        seen = self.positions if self.fixed else int(positions[-1]) + 1
         mask = torch.arange(seen)[None] <= positions[:, None]  # (new, seen)
         groups = config.num_attention_heads // config.num_key_value_heads
         for index, layer in enumerate(decoder.layers):

@@ -13,7 +13,7 @@ use crate::strategy::{Decision, Strategy};
 use crate::verifier::Verifier;
 
 /// Numbers of candidates that are timed.
-pub const CANDIDATES: [usize; 5] = [1, 2, 5, 8, 16];
+const CANDIDATES: [usize; 5] = [1, 2, 5, 8, 16];
 /// The number that ratios are of: the default of every command.
 const CANDIDATES_DEFAULT: usize = 5;
 /// Rounds before any is counted: caches fill, compilers compile.

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -37,8 +37,8 @@ struct DecisionArguments {
     #[arg(long, value_name = "FILE")]
     observations: Option<PathBuf>,
     /// Passes over all observations
-    #[arg(long, default_value_t = 12)]
-    rounds: usize,
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..))]
+    rounds: u32,
     /// Make the same decisions in PyTorch, in turns
     #[arg(long)]
     compare: bool,
@@ -68,15 +68,14 @@ pub fn run(arguments: Arguments) -> Result<()> {
     } else {
         None
     };
-    ensure!(arguments.rounds > 0, "rounds: expected at least 1, got 0");
-    let progress = ProgressBar::new(arguments.rounds as u64 + 1);
+    let progress = ProgressBar::new(u64::from(arguments.rounds) + 1);
     let style = "bench: {pos}/{len} rounds, {eta} left";
     progress.set_style(ProgressStyle::with_template(style).context("progress line")?);
     let bench = DecisionBench {
         policy: &policy,
         verifier: &verifier,
         observations: &observations,
-        rounds: arguments.rounds,
+        rounds: arguments.rounds as usize,
     };
     let report = bench.run(torch, |round| progress.set_position(round as u64))?;
     progress.finish_and_clear();

@@ -8,10 +8,10 @@ use anyhow::{Context, anyhow};
 use protocol::{EpisodeOutcome, decode, encode};
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
-use zenoh::Session;
 use zenoh::qos::{CongestionControl, Reliability};
 use zenoh::query::{ConsolidationMode, QueryTarget, ReplyKeyExpr};
 use zenoh::sample::Sample;
+use zenoh::{Session, Wait};
 use zenoh_ext::{
     AdvancedPublisher, AdvancedPublisherBuilderExt, AdvancedSubscriber,
     AdvancedSubscriberBuilderExt, CacheConfig, HistoryConfig, MissDetectionConfig, RecoveryConfig,
@@ -116,25 +116,24 @@ impl Beginnings {
     /// Asks for all that came before `sample`, if it is the first one of its publisher.
     fn fetch(&self, sample: &Sample, sender: &mpsc::Sender<EpisodeOutcome>) {
         let Some(source) = sample.source_info() else { return };
-        let publisher = (source.source_id().zid().to_string(), source.source_id().eid());
-        let (zid, eid) = &publisher;
+        let (zid, eid) = (source.source_id().zid().to_string(), source.source_id().eid());
+        // Where zenoh-ext's cache of one publisher answers.
         let cache = format!("{}/@adv/*/{zid}/{eid}/**", sample.key_expr());
-        let is_new =
-            self.known.lock().unwrap_or_else(PoisonError::into_inner).insert(publisher.clone());
+        let is_new = self.known.lock().unwrap_or_else(PoisonError::into_inner).insert((zid, eid));
         let Some(last) = source.source_sn().checked_sub(1).filter(|_| is_new) else { return };
         let sender = sender.clone();
-        let asked = zenoh::Wait::wait(
-            self.session
-                .get(format!("{cache}?_sn=0..{last}"))
-                .callback(move |reply| {
-                    if let Ok(sample) = reply.result() {
-                        receive(&sender, sample);
-                    }
-                })
-                .consolidation(ConsolidationMode::None)
-                .accept_replies(ReplyKeyExpr::Any)
-                .target(QueryTarget::All),
-        );
+        let asked = self
+            .session
+            .get(format!("{cache}?_sn=0..{last}"))
+            .callback(move |reply| {
+                if let Ok(sample) = reply.result() {
+                    receive(&sender, sample);
+                }
+            })
+            .consolidation(ConsolidationMode::None)
+            .accept_replies(ReplyKeyExpr::Any)
+            .target(QueryTarget::All)
+            .wait();
         if let Err(error) = asked {
             tracing::warn!(%error, "the first outcomes of {} may be missing", sample.key_expr());
         }
