@@ -46,7 +46,8 @@ impl Lanes {
             .min(self.pools.len())
             .min(rayon::current_num_threads());
         if lanes < 2 {
-            return complete(network, sessions, limits);
+            // From outside of its pool, each of a step's dozens of products would wake a thread and wait for it.
+            return rayon::scope(|_| complete(network, sessions, limits));
         }
         let run = |lane: usize| -> Result<Vec<Completion>> {
             let start = lane * sessions.len() / lanes;

@@ -38,6 +38,7 @@ mod matmul;
 mod norm;
 mod rotary;
 mod segment;
+mod tile;
 
 // Tokens: prompts in, draws, meaning.
 mod actions;

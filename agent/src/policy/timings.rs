@@ -22,6 +22,16 @@ pub fn measure(
     candidates: usize,
     tokens: usize,
 ) -> Result<Timings> {
+    // As `Lanes::complete` runs one lane.
+    rayon::scope(|_| measure_inside(network, contexts, candidates, tokens))
+}
+
+fn measure_inside(
+    network: &Network,
+    contexts: &[Context<'_>],
+    candidates: usize,
+    tokens: usize,
+) -> Result<Timings> {
     let start = Instant::now();
     let (prefix, hidden) = network.prefill_all(contexts)?;
     network.decoder.logits(&hidden)?;
