@@ -1,5 +1,7 @@
 //! What `rever bench` prints and refuses; how fast anything is, no test says.
 
+use std::path::Path;
+
 use serde_json::Value;
 
 use crate::harness::{rever, run, succeed, text};
@@ -22,6 +24,47 @@ fn a_benchmark_of_decisions_prints_a_table_and_writes_the_same_figures() {
         assert!(table.contains(&format!("{:.1}", figure("decision_ms_p95"))), "{table}");
     }
     assert!(report["ratio_greedy"].is_number() && report["ratio_eager"].is_null(), "{report}");
+}
+
+#[test]
+fn a_benchmark_of_throughput_counts_decisions_at_every_number_of_sessions() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("bench.json");
+    let mut bench = rever();
+    bench.args(["bench", "throughput", "--sessions", "1,3", "--decisions", "70", "--json"]);
+    let table = succeed(bench.arg(&file));
+    let rows = rows(&file);
+    let sessions: Vec<_> = rows.iter().map(|row| row["sessions"].as_u64()).collect();
+    assert_eq!(sessions, [1, 3].map(Some));
+    for row in rows {
+        let figure = |name: &str| row[name].as_f64().expect("a number");
+        assert!(figure("decisions") >= 70.0 && figure("decisions_per_second") > 0.0, "{row}");
+        assert!(figure("memory_mb_after") > 1.0, "{row}");
+        assert!(table.contains(&format!("{:.1}", figure("decisions_per_second"))), "{table}");
+    }
+}
+
+#[test]
+fn a_benchmark_of_the_wire_takes_steps_and_repeated_replies_in_turns() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("bench.json");
+    let mut bench = rever();
+    bench.args(["bench", "wire", "--sessions", "1,5", "--steps", "60", "--side", "64", "--json"]);
+    succeed(bench.arg(&file));
+    let rows = rows(&file);
+    let steps: Vec<_> = rows.iter().map(|row| row["steps"].as_u64()).collect();
+    // 60 steps of each session; an episode that is over is begun anew.
+    assert_eq!(steps, [60, 300].map(Some));
+    for row in rows {
+        assert!(row["wire_ms_p50"].as_f64() > Some(0.0), "{row}");
+        assert!(row["step_ms_p50"].as_f64() > row["wire_ms_p50"].as_f64(), "{row}");
+    }
+}
+
+fn rows(file: &Path) -> Vec<Value> {
+    let figures = std::fs::read(file).expect("the figures");
+    let figures: Value = serde_json::from_slice(&figures).expect("JSON");
+    figures["rows"].as_array().expect("rows").clone()
 }
 
 #[test]

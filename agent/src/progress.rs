@@ -4,18 +4,27 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use tokio::sync::watch;
 
 /// How often a plain line is printed where there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// What a run has done since it was started.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Control steps of all episodes.
+    pub steps: u64,
+    /// Recorded episodes.
+    pub episodes: u64,
+}
 
 /// How far a run has come. Episodes that were recorded before this start count as done, but not for the estimate.
 pub struct Progress {
     bar: Option<ProgressBar>,
     total: u64,
     done: u64,
-    done_before: u64,
     successes: u64,
-    steps: u64,
+    counts: watch::Sender<Counts>,
     /// Steps of the episodes that were recorded since the start.
     steps_recorded: u64,
     faults: u64,
@@ -42,9 +51,8 @@ impl Progress {
             bar,
             total,
             done,
-            done_before: done,
             successes,
-            steps: 0,
+            counts: watch::Sender::default(),
             steps_recorded: 0,
             faults: 0,
             running: 0,
@@ -53,16 +61,22 @@ impl Progress {
         }
     }
 
+    /// For whoever measures how fast it goes.
+    pub fn counts(&self) -> watch::Receiver<Counts> {
+        self.counts.subscribe()
+    }
+
     /// One control step of `running` episodes is over.
     pub fn stepped(&mut self, running: usize) {
         self.running = running;
-        self.steps += running as u64;
+        self.counts.send_modify(|counts| counts.steps += running as u64);
         self.show();
     }
 
     /// An episode of so many steps is recorded.
     pub fn recorded(&mut self, is_success: bool, steps: usize) {
         self.done += 1;
+        self.counts.send_modify(|counts| counts.episodes += 1);
         self.steps_recorded += steps as u64;
         self.successes += u64::from(is_success);
         self.show();
@@ -103,13 +117,13 @@ impl Progress {
 
     fn line(&self, elapsed: Duration) -> String {
         let secs = elapsed.as_secs_f64().max(1e-3);
-        let here = self.done - self.done_before;
+        let Counts { steps, episodes: here } = *self.counts.borrow();
         let mut parts = Vec::new();
         if self.done > 0 {
             parts
                 .push(format!("success {:.0} %", 100.0 * self.successes as f64 / self.done as f64));
         }
-        parts.push(format!("{:.1} steps/s", self.steps as f64 / secs));
+        parts.push(format!("{:.1} steps/s", steps as f64 / secs));
         if self.faults > 0 {
             parts.push(format!("{} faults", self.faults));
         }
@@ -117,8 +131,8 @@ impl Progress {
         if here > 0 && self.done < self.total {
             let steps_expected =
                 (self.total - self.done) as f64 * self.steps_recorded as f64 / here as f64;
-            let steps_ahead = (self.steps - self.steps_recorded) as f64;
-            let left = (steps_expected - steps_ahead).max(0.0) * secs / self.steps.max(1) as f64;
+            let steps_ahead = (steps - self.steps_recorded) as f64;
+            let left = (steps_expected - steps_ahead).max(0.0) * secs / steps.max(1) as f64;
             parts.push(format!("{} left", clock(left)));
         } else if self.done < self.total {
             parts.push(format!("{} running", self.running));

@@ -1,4 +1,4 @@
-"""Command line: expert (success table), demonstrate (training episodes), serve, health."""
+"""Command line: expert (success table), demonstrate (training episodes), serve, health, bench."""
 
 import argparse
 import os
@@ -50,6 +50,16 @@ def _parser() -> argparse.ArgumentParser:
 
     check = commands.add_parser("health", help="ask servers whether they still work")
     health.add_arguments(check)
+
+    times = commands.add_parser("bench", help="time a control step with its image")
+    _add_tasks(times)
+    times.add_argument("--steps", type=int, default=200, help="per task and kind (default: 200)")
+    times.add_argument("--side", type=int, default=224, help="of the image (default: 224)")
+    times.add_argument(
+        "--robosuite", action="store_true", help="with robosuite's Stack and Panda in turns"
+    )
+    times.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    times.set_defaults(run=_bench)
     return parser
 
 
@@ -72,6 +82,18 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
     for name, (kept, failed) in counts.items():
         print(f"{name}: {kept} kept, {failed} failed")
     return 0
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from rever_env import bench, tasks
+
+    return bench.bench(
+        tasks.choose(tasks.load(), arguments.tasks),
+        arguments.side,
+        arguments.steps,
+        with_robosuite=arguments.robosuite,
+        file=arguments.json,
+    )
 
 
 def _expert(arguments: argparse.Namespace) -> int:

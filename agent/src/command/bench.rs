@@ -1,15 +1,18 @@
 //! `rever bench`: what the parts of the program cost on this machine.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
 
 use super::episodes::policy_folder;
-use crate::bench::{DecisionBench, Report, Torch, read_observations};
+use crate::bench::{DecisionBench, Report, ThroughputBench, Torch, WireBench, read_observations};
 use crate::policy::Policy;
 use crate::setup;
+use crate::site::Site;
 use crate::verifier::Verifier;
 
 /// What the parts of the program cost on this machine.
@@ -22,6 +25,8 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Part {
     Decision(DecisionArguments),
+    Throughput(ThroughputArguments),
+    Wire(WireArguments),
 }
 
 /// One decision at a time on recorded observations: prefill, decode, parse, score, choose
@@ -50,9 +55,139 @@ struct DecisionArguments {
     json: Option<PathBuf>,
 }
 
+/// Whole episodes, many at once: decisions and episodes per second, and this process's memory
+#[derive(Debug, Args)]
+struct ThroughputArguments {
+    /// Episodes at once, separated by commas
+    #[arg(long, value_delimiter = ',', default_value = "1,2,4,8,16",
+          value_parser = clap::value_parser!(u16).range(1..=256))]
+    sessions: Vec<u16>,
+    /// Decisions that are counted for each number of sessions
+    #[arg(long, default_value_t = 2_000, value_parser = clap::value_parser!(u64).range(1..))]
+    decisions: u64,
+    /// Candidates per decision
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=256))]
+    candidates: u32,
+    /// Server processes to start
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=64))]
+    servers: u16,
+    /// The checkpoint's folder, with its verifier [default: the one that comes with rever]
+    #[arg(long)]
+    policy: Option<PathBuf>,
+    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    #[arg(long, value_name = "FILE")]
+    python: Option<PathBuf>,
+    /// Write the figures into this file, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Control steps over the wire beside repeated replies, which cost the wire and no simulator
+#[derive(Debug, Args)]
+struct WireArguments {
+    /// Sessions of one server that ask at once, separated by commas
+    #[arg(long, value_delimiter = ',', default_value = "1,8,32",
+          value_parser = clap::value_parser!(u16).range(1..=64))]
+    sessions: Vec<u16>,
+    /// Control steps of every session
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
+    steps: u32,
+    /// Height and width of the image
+    #[arg(long, default_value_t = 224, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    side: u32,
+    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    #[arg(long, value_name = "FILE")]
+    python: Option<PathBuf>,
+    /// Write the figures into this file, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
 /// Times what was asked for and prints a table.
 pub fn run(arguments: Arguments) -> Result<()> {
-    let Part::Decision(arguments) = arguments.part;
+    match arguments.part {
+        Part::Decision(arguments) => decision(arguments),
+        Part::Throughput(arguments) => throughput(arguments),
+        Part::Wire(arguments) => wire(arguments),
+    }
+}
+
+fn wire(arguments: WireArguments) -> Result<()> {
+    let site = site(1, arguments.python);
+    let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
+    let steps = arguments.steps as usize;
+    let rows = WireBench { site: &site, sessions: &sessions, steps, side: arguments.side }.run()?;
+    if let Some(path) = &arguments.json {
+        write_json(path, &serde_json::json!({ "side": arguments.side, "rows": rows }))?;
+    }
+    println!(
+        "{:>8} {:>7} {:>9} {:>9} {:>9} {:>8}",
+        "sessions", "steps", "step ms", "wire ms", "wire p95", "share"
+    );
+    for row in rows {
+        println!(
+            "{:>8} {:>7} {:>9.3} {:>9.3} {:>9.3} {:>6.1} %",
+            row.sessions,
+            row.steps,
+            row.step_ms_p50,
+            row.wire_ms_p50,
+            row.wire_ms_p95,
+            100.0 * row.wire_ms_p50 / row.step_ms_p50
+        );
+    }
+    println!("one server, {0} x {0} pixels; per step, medians", arguments.side);
+    Ok(())
+}
+
+/// Servers of this benchmark alone.
+fn site(servers: usize, python: Option<PathBuf>) -> Site {
+    let (connect, listen, fleet) = (Vec::new(), Vec::new(), "bench".to_owned());
+    Site { servers, connect, listen, fleet, python }
+}
+
+fn throughput(arguments: ThroughputArguments) -> Result<()> {
+    let folder = policy_folder(arguments.policy.as_ref())?;
+    let policy = Policy::load(&folder)?;
+    let verifier = Verifier::load(&folder.join("verifier.safetensors"), policy.digest())?;
+    let site = site(usize::from(arguments.servers), arguments.python);
+    let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
+    let bench = ThroughputBench {
+        policy: &policy,
+        verifier: Arc::new(verifier),
+        site: &site,
+        sessions: &sessions,
+        decisions: arguments.decisions,
+        candidates: arguments.candidates,
+    };
+    let rows = bench.run()?;
+    if let Some(path) = &arguments.json {
+        write_json(path, &serde_json::json!({ "candidates": arguments.candidates, "rows": rows }))?;
+    }
+    println!(
+        "{:>8} {:>10} {:>12} {:>11} {:>9} {:>9}",
+        "sessions", "decisions", "decisions/s", "episodes/s", "MB before", "MB after"
+    );
+    for row in rows {
+        println!(
+            "{:>8} {:>10} {:>12.1} {:>11.2} {:>9.1} {:>9.1}",
+            row.sessions,
+            row.decisions,
+            row.decisions_per_second,
+            row.episodes_per_second,
+            row.memory_mb_before,
+            row.memory_mb_after
+        );
+    }
+    println!("{} candidates, {} server processes", arguments.candidates, arguments.servers);
+    Ok(())
+}
+
+fn write_json(path: &Path, figures: &impl Serialize) -> Result<()> {
+    let text = serde_json::to_string_pretty(figures)?;
+    std::fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn decision(arguments: DecisionArguments) -> Result<()> {
     let folder = policy_folder(arguments.policy.as_ref())?;
     let file = arguments.verifier.unwrap_or_else(|| folder.join("verifier.safetensors"));
     let policy = Policy::load(&folder)?;
@@ -80,9 +215,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let report = bench.run(torch, |round| progress.set_position(round as u64))?;
     progress.finish_and_clear();
     if let Some(path) = &arguments.json {
-        let text = serde_json::to_string_pretty(&report)?;
-        std::fs::write(path, text + "\n")
-            .with_context(|| format!("cannot write {}", path.display()))?;
+        write_json(path, &report)?;
     }
     print(&report);
     Ok(())

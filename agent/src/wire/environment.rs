@@ -27,6 +27,8 @@ pub struct Environment {
     timing: Timing,
     /// Of the last request that was sent.
     sequence: u64,
+    /// The last request as it was sent.
+    request: ZBytes,
     /// Times that the server's token had gone when the session was opened.
     losses: u32,
     signs: watch::Receiver<Sign>,
@@ -79,6 +81,7 @@ impl Environment {
             image_width: open.image_width as usize,
             timing: network.timing,
             sequence: 0,
+            request: ZBytes::new(),
             losses,
             signs,
             replies,
@@ -137,13 +140,22 @@ impl Environment {
     ) -> Result<Reply, EnvironmentFault> {
         let sequence = self.sequence + 1;
         let bytes = encode(&request(sequence)).map_err(|error| EnvironmentFault::unsent(&error))?;
-        let bytes = ZBytes::from(bytes);
+        self.request = ZBytes::from(bytes);
         self.sequence = sequence;
+        self.ask_again(asked).await
+    }
+
+    /// Sends the last request once more, until its reply comes. A server that has answered it before gives the same
+    /// bytes again and does nothing else.
+    pub(super) async fn ask_again(
+        &mut self,
+        asked: &'static str,
+    ) -> Result<Reply, EnvironmentFault> {
         let asked_at = Instant::now();
         let mut resend = self.timing.resend;
         loop {
             self.check_server(asked, asked_at)?;
-            self.publisher.put(bytes.clone()).await.map_err(EnvironmentFault::wire)?;
+            self.publisher.put(self.request.clone()).await.map_err(EnvironmentFault::wire)?;
             if let Some(reply) = self.reply_within(resend, asked, asked_at).await? {
                 return match reply {
                     Reply::Refused { reason, .. } => Err(EnvironmentFault::Refused { reason }),

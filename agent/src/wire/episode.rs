@@ -42,6 +42,11 @@ impl Episode {
         }
     }
 
+    /// Has the last reply sent once more; the world does not move. It costs what the wire costs, without a simulator.
+    pub async fn repeat(&mut self) -> Result<(), EnvironmentFault> {
+        self.environment.ask_again("the last request again").await.map(drop)
+    }
+
     /// Keeps the present state in `slot` until the episode's end.
     pub async fn save(&mut self, slot: u32) -> Result<(), EnvironmentFault> {
         match self.environment.ask("Save", |sequence| Request::Save { sequence, slot }).await? {

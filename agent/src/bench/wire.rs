@@ -1,0 +1,176 @@
+//! What a control step costs over the wire, beside what the simulator needs for it.
+//!
+//! A server that is asked the same again sends the same reply again, image and all, without simulating anything. So
+//! steps and repetitions, in turns, tell the wire from the world: request, queue, reply and decoding are in both. What a
+//! repetition leaves out is the encoding of the reply in the server, one copy of an image.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, ensure};
+use protocol::{Open, PROTOCOL_VERSION, Reset};
+use serde::Serialize;
+use tokio::task::JoinSet;
+
+use super::quantile;
+use crate::site::Site;
+use crate::suite::{SeedRange, TASKS, VARIANT_DEFAULT};
+use crate::wire::{Environment, EnvironmentFault, Episode, Network};
+
+/// Steps before an episode is begun anew: no task's horizon is shorter.
+const EPISODE_STEPS: usize = 50;
+/// The first steps fill caches.
+const WARM_UP_STEPS: usize = 5;
+/// Nothing moves, and the gripper stays open.
+const HOLD_STILL: [f32; 7] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+/// The local server is on the network already.
+const SERVER_WAIT: Duration = Duration::from_secs(30);
+
+/// One number of sessions on one server, all of them asking at once.
+#[derive(Debug, Clone, Serialize)]
+pub struct Row {
+    /// Sessions of the server.
+    pub sessions: usize,
+    /// Of all sessions, counted.
+    pub steps: usize,
+    /// One control step with its image: the time of all sessions' steps over their number, median.
+    pub step_ms_p50: f64,
+    /// A repeated reply, likewise.
+    pub wire_ms_p50: f64,
+    /// The slow ones.
+    pub wire_ms_p95: f64,
+}
+
+/// What is timed.
+pub struct WireBench<'a> {
+    /// Where the server is started.
+    pub site: &'a Site,
+    /// Numbers of sessions.
+    pub sessions: &'a [usize],
+    /// Control steps of every session.
+    pub steps: usize,
+    /// Of the image, in pixels.
+    pub side: u32,
+}
+
+impl WireBench<'_> {
+    /// Starts one server and takes turns for each number of sessions.
+    pub fn run(&self) -> Result<Vec<Row>> {
+        ensure!(self.steps > 0, "steps: expected at least 1, got 0");
+        ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
+        let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
+        let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+        let python = self.site.python_environment()?;
+        let network = runtime.block_on(Network::open(self.site.network_options()))?;
+        let local = self.site.start(&python, &network, most)?;
+        let rows = runtime.block_on(async {
+            let found = network.servers(1, SERVER_WAIT).await;
+            let server = &found.first().context("the local server was not to be seen")?.server;
+            let mut environments = Vec::new();
+            for index in 0..most {
+                environments.push(self.open(&network, server, index).await?);
+            }
+            let mut rows = Vec::new();
+            for &sessions in self.sessions {
+                let rest = environments.split_off(sessions);
+                let (row, used) = self.count(environments).await?;
+                rows.push(row);
+                environments = used;
+                environments.extend(rest);
+            }
+            anyhow::Ok(rows)
+        });
+        // The server first: it would report the network's end as an error.
+        drop(local);
+        runtime.block_on(network.close())?;
+        rows
+    }
+
+    async fn open(&self, network: &Network, server: &str, index: usize) -> Result<Environment> {
+        let open = Open {
+            protocol: PROTOCOL_VERSION,
+            task: TASKS[index % TASKS.len()].to_owned(),
+            variant: VARIANT_DEFAULT.to_owned(),
+            image_height: self.side,
+            image_width: self.side,
+            expert: false,
+            holder: "bench".to_owned(),
+        };
+        Environment::open(network, server, open).await.context("cannot open a session")
+    }
+
+    /// Steps and repetitions of these sessions in turns.
+    async fn count(&self, environments: Vec<Environment>) -> Result<(Row, Vec<Environment>)> {
+        let sessions = environments.len();
+        let (mut stepped, mut repeated) = (Vec::new(), Vec::new());
+        let mut episodes = reset(environments).await?;
+        for index in 0..WARM_UP_STEPS + self.steps {
+            if index % EPISODE_STEPS == EPISODE_STEPS - 1 {
+                episodes = reset(episodes.into_iter().map(Episode::finish).collect()).await?;
+            }
+            let (step_ms, after) = at_once(episodes, |mut episode: Episode| async move {
+                episode.step(HOLD_STILL).await.map(|_| episode)
+            })
+            .await?;
+            let (wire_ms, after) = at_once(after, |mut episode: Episode| async move {
+                episode.repeat().await.map(|()| episode)
+            })
+            .await?;
+            episodes = after;
+            if index >= WARM_UP_STEPS {
+                stepped.push(step_ms);
+                repeated.push(wire_ms);
+            }
+        }
+        stepped.sort_by(f64::total_cmp);
+        repeated.sort_by(f64::total_cmp);
+        let row = Row {
+            sessions,
+            steps: self.steps * sessions,
+            step_ms_p50: quantile(&stepped, 0.5),
+            wire_ms_p50: quantile(&repeated, 0.5),
+            wire_ms_p95: quantile(&repeated, 0.95),
+        };
+        Ok((row, episodes.into_iter().map(Episode::finish).collect()))
+    }
+}
+
+/// Begins an episode in every session.
+async fn reset(environments: Vec<Environment>) -> Result<Vec<Episode>> {
+    let begin = |(index, environment): (usize, Environment)| {
+        let reset = Reset {
+            task: TASKS[index % TASKS.len()].to_owned(),
+            variant: VARIANT_DEFAULT.to_owned(),
+            configuration: None,
+            seed: SeedRange::Tuning.first() + index as u64,
+        };
+        environment.reset(reset)
+    };
+    let (_, episodes) = at_once(environments.into_iter().enumerate().collect(), begin).await?;
+    Ok(episodes)
+}
+
+/// Asks something of all sessions at once; milliseconds over their number, and what came back, in order.
+async fn at_once<From, To, Answer>(
+    sessions: Vec<From>,
+    ask: impl Fn(From) -> Answer,
+) -> Result<(f64, Vec<To>)>
+where
+    To: Send + 'static,
+    Answer: Future<Output = Result<To, EnvironmentFault>> + Send + 'static,
+{
+    let count = sessions.len();
+    let begun = Instant::now();
+    let mut asked = JoinSet::new();
+    for (index, session) in sessions.into_iter().enumerate() {
+        let answer = ask(session);
+        asked.spawn(async move { (index, answer.await) });
+    }
+    let mut answers = Vec::with_capacity(count);
+    while let Some(joined) = asked.join_next().await {
+        let (index, answer) = joined.context("a request panicked")?;
+        answers.push((index, answer?));
+    }
+    let ms = begun.elapsed().as_secs_f64() * 1e3 / count as f64;
+    answers.sort_by_key(|(index, _)| *index);
+    Ok((ms, answers.into_iter().map(|(_, answer)| answer).collect()))
+}

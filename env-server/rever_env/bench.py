@@ -1,0 +1,183 @@
+"""The bench subcommand: a control step with its image, beside what it is made of, and robosuite's.
+
+Blocks of steps are taken in turns, so that a machine that slows down slows all of them down.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rever_env.tasks import Task
+from rever_env.world import World
+
+_BLOCK = 10  # steps in a row of one kind
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+_CONTROL_HZ = 5
+
+Block = Callable[[], list[float]]  # runs _BLOCK steps; seconds of each
+
+
+@dataclass(frozen=True)
+class Row:
+    """Times of one kind of step."""
+
+    what: str
+    steps: int
+    p50_ms: float
+    p95_ms: float
+
+
+def bench(
+    tasks: list[Task], side: int, steps: int, *, with_robosuite: bool, file: Path | None
+) -> int:
+    """Prints a table and the ratios of medians; writes them into the file, too."""
+    if steps < _BLOCK or side < 1:
+        print(
+            f"error: expected at least {_BLOCK} steps and 1 pixel, got {steps} and {side}",
+            file=sys.stderr,
+        )
+        return 2
+    try:
+        other = _robosuite(side) if with_robosuite else None
+    except ImportError as error:
+        print(f"error: --robosuite needs robosuite 1.5.2 ({error})", file=sys.stderr)
+        return 2
+    rows = measure(tasks, side, steps, other)
+    ratios = _ratios(rows)
+    print(f"{'control step':44} {'steps':>6} {'p50 ms':>8} {'p95 ms':>8}")
+    for row in rows:
+        print(f"{row.what:44} {row.steps:6} {row.p50_ms:8.2f} {row.p95_ms:8.2f}")
+    print(f"{side} x {side} pixels, {_CONTROL_HZ} Hz control")
+    for name, ratio in ratios.items():
+        print(f"{name} {ratio:.2f}")
+    if file:
+        figures = {"side": side, "rows": [asdict(row) for row in rows], **ratios}
+        file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+def measure(tasks: list[Task], side: int, steps: int, other: Block | None = None) -> list[Row]:
+    """Per task a step of the world and the same as bare MuJoCo calls; last the other simulator."""
+    rows = []
+    others: list[float] = []
+    for task in tasks:
+        with World(task, side, side) as world:
+            blocks = _Blocks(world, side)
+            ours: list[float] = []
+            bare: list[float] = []
+            for index in range(1 + steps // _BLOCK):
+                seconds = (blocks.world(), blocks.bare(), other() if other else [])
+                if index > 0:  # in the first one caches fill and shaders compile
+                    for times, more in zip((ours, bare, others), seconds, strict=True):
+                        times.extend(more)
+            blocks.close()
+        rows += [_row(task.name, ours), _row(f"{task.name}, bare", bare)]
+    return rows + ([_row("robosuite Stack, Panda", others)] if other else [])
+
+
+class _Blocks:
+    """The expert at work, and the same states again without anything of ours."""
+
+    def __init__(self, world: World, side: int) -> None:
+        self._world = world
+        self._substeps = world.task.settings.substeps
+        self._camera = world.task.settings.camera
+        self._spare = mujoco.MjData(world.model)
+        self._renderer = mujoco.Renderer(world.model, side, side)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._renderer.scene.flags[flag] = 0
+        self._seed = 0
+        self._states: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+
+    def world(self) -> list[float]:
+        """Control steps of the world."""
+        world = self._world
+        self._states.clear()
+        seconds = []
+        for _ in range(_BLOCK):
+            if world.memory is None or world.steps >= world.task.steps_max:
+                world.reset(configuration=None, seed=self._seed)
+                self._seed += 1
+            action = world.expert_action()
+            state = np.empty(mujoco.mj_stateSize(world.model, _STATE))
+            mujoco.mj_getState(world.model, world.data, state, _STATE)
+            begun = time.perf_counter()
+            world.step(action)
+            seconds.append(time.perf_counter() - begun)
+            self._states.append((state, world.data.ctrl.copy()))
+        return seconds
+
+    def bare(self) -> list[float]:
+        """The same physics and the same picture by MuJoCo's own calls."""
+        model, data = self._world.model, self._spare
+        seconds = []
+        for state, control in self._states:
+            mujoco.mj_setState(model, data, state, _STATE)
+            data.ctrl[:] = control
+            begun = time.perf_counter()
+            mujoco.mj_step(model, data, self._substeps)
+            self._renderer.update_scene(data, self._camera)
+            self._renderer.render()
+            seconds.append(time.perf_counter() - begun)
+        return seconds
+
+    def close(self) -> None:
+        self._renderer.close()
+
+
+def _robosuite(side: int) -> Block:
+    """Steps of robosuite's Stack with a Panda, one camera and small random actions."""
+    import robosuite
+
+    environment: Any = robosuite.make(
+        "Stack",
+        robots="Panda",
+        has_renderer=False,
+        has_offscreen_renderer=True,
+        use_camera_obs=True,
+        camera_heights=side,
+        camera_widths=side,
+        control_freq=_CONTROL_HZ,
+        ignore_done=True,
+    )
+    environment.reset()
+    random = np.random.default_rng(0)
+    low, high = environment.action_spec
+
+    def block() -> list[float]:
+        seconds = []
+        for _ in range(_BLOCK):
+            action = 0.2 * random.uniform(low, high)
+            begun = time.perf_counter()
+            environment.step(action)
+            seconds.append(time.perf_counter() - begun)
+        return seconds
+
+    return block
+
+
+def _row(what: str, seconds: list[float]) -> Row:
+    p50, p95 = (1e3 * float(number) for number in np.percentile(seconds, (50, 95)))
+    return Row(what, len(seconds), p50, p95)
+
+
+def _ratios(rows: list[Row]) -> dict[str, float]:
+    """ratio_bare: bare calls over ours, mean of the tasks; ratio_robosuite: robosuite over ours."""
+    bare = list(_pairs(rows))
+    ours = float(np.mean([world.p50_ms for world, _ in bare]))
+    ratios = {"ratio_bare": float(np.mean([one.p50_ms / world.p50_ms for world, one in bare]))}
+    if len(rows) % 2:
+        ratios["ratio_robosuite"] = rows[-1].p50_ms / ours
+    return ratios
+
+
+def _pairs(rows: list[Row]) -> Iterator[tuple[Row, Row]]:
+    return zip(rows[0 : len(rows) // 2 * 2 : 2], rows[1::2], strict=True)
