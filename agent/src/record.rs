@@ -17,7 +17,7 @@ use crate::strategy::Strategy;
 use crate::suite::Arm;
 
 /// Version of the format; a record of another version is refused.
-pub const RECORD_VERSION: u32 = 2;
+pub const RECORD_VERSION: u32 = 3;
 
 /// What is known of a finished episode.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -106,6 +106,8 @@ pub struct Versions {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StepRecord {
+    /// What the robot felt before: x y z (m), roll pitch yaw (rad), 0, gripper opening; Bridge's order.
+    pub state: [f32; 8],
     /// All that were sampled.
     pub candidates: Vec<CandidateRecord>,
     /// The executed one; none when no candidate was well formed and the robot held still.
@@ -264,6 +266,7 @@ pub(crate) mod tests {
                 ..Statistics::default()
             },
             steps: vec![StepRecord {
+                state: [0.25; 8],
                 candidates: vec![candidate, malformed],
                 chosen: Some(0),
                 statistics: Statistics::default(),

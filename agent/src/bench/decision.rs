@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::torch::{Hello, Torch};
 use super::{Observation, bandwidth, quantile};
 use crate::policy::{Policy, ProposalRequest};
-use crate::rollout::{candidate_action, score};
+use crate::rollout::{Scene, candidate_action, score};
 use crate::strategy::{Decision, Strategy};
 use crate::verifier::Verifier;
 
@@ -167,7 +167,10 @@ impl DecisionBench<'_> {
         let proposal = policy.propose(&[request])?.pop().context("no proposal")?;
         let actions: Vec<_> = proposal.candidates.iter().map(candidate_action).collect();
         // Greedy decoding asks no verifier.
-        let logits = (temperature > 0.0).then(|| score(verifier, &proposal, policy));
+        let logits = (temperature > 0.0).then(|| {
+            let scene = Scene { instruction: instruction.clone(), ..Scene::default() };
+            score(verifier, &proposal, policy, &mut { scene })
+        });
         let strategy = if logits.is_some() { Strategy::Verifier } else { Strategy::Greedy };
         std::hint::black_box(strategy.choose(&Decision {
             candidates: &actions,

@@ -13,7 +13,7 @@ use crate::record::write_whole;
 use crate::table::aligned;
 use crate::training::records::{self, Reader};
 use crate::training::{Epoch, LabelledEpisode, TrainingSet, train};
-use crate::verifier::{Description, Discrimination, Gain, Metrics, Options, Verifier};
+use crate::verifier::{Description, Discrimination, Gain, Metrics, Options, Verifier, Words};
 use crate::wire::{Network, NetworkOptions, VerifierPublisher};
 
 /// How long to look for agents that follow the verifier before it is published to nobody yet.
@@ -51,6 +51,9 @@ pub struct Arguments {
     /// Share of the episodes of every task that is held out
     #[arg(long, default_value_t = Options::default().held_out_share)]
     held_out_share: f64,
+    /// What the weights of the nearness to the target are multiplied by; 0 leaves the target out
+    #[arg(long, default_value_t = Options::default().aim_factor)]
+    aim_factor: f64,
     /// Leave out the part that compares candidates: the paper's verifier
     #[arg(long)]
     plain: bool,
@@ -94,8 +97,13 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let action_scale = policy.action_scale();
     let confidence =
         |tokens: &[u32], log_probabilities: &[f32]| policy.confidence(tokens, log_probabilities);
-    let reader =
-        Reader { policy: policy.digest(), action_scale: &action_scale, confidence: &confidence };
+    let words = |tokens: &[u32]| Words::of(&policy.parse(tokens).ok()?.reasoning);
+    let reader = Reader {
+        policy: policy.digest(),
+        action_scale: &action_scale,
+        confidence: &confidence,
+        words: &words,
+    };
     let (episodes, set_aside) = read(&arguments, reader)?;
     ensure!(
         !episodes.is_empty(),
@@ -147,6 +155,7 @@ fn options(arguments: &Arguments) -> Result<Options> {
         weight_decay: arguments.weight_decay,
         held_out_share: arguments.held_out_share,
         choice: !arguments.plain,
+        aim_factor: arguments.aim_factor,
         ..Options::default()
     })
 }
@@ -277,6 +286,7 @@ mod tests {
     fn verifier() -> Verifier {
         let episode = |number: usize| LabelledEpisode {
             name: format!("{number:02}"),
+            instruction: String::new(),
             task: if number < 20 { "mixed" } else { "easy" }.to_owned(),
             is_success: number >= 10,
             hidden: (0..40)

@@ -105,6 +105,7 @@ fn record(identity: EpisodeIdentity, is_success: bool, random: &mut StdRng) -> E
             let made: Vec<CandidateRecord> =
                 (0..identity.candidates).map(|_| candidate(level, random)).collect();
             StepRecord {
+                state: [0.0; 8],
                 chosen: (0..)
                     .zip(&made)
                     .find(|(_, one)| one.action.is_some())

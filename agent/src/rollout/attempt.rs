@@ -13,7 +13,7 @@ use crate::record::{
 };
 use crate::strategy::{CandidateAction, Decision};
 use crate::suite::step_seed;
-use crate::verifier::{Sibling, Siblings, Verifier, probability};
+use crate::verifier::{Memory, Sibling, Siblings, Verifier, Words, probability};
 use crate::video::Video;
 use crate::wire::Episode;
 
@@ -27,12 +27,23 @@ pub struct Attempt {
     pub episode: Episode,
     /// The same from the first step to the last, whatever is published meanwhile.
     verifier: Option<Arc<Verifier>>,
-    instruction: String,
+    scene: Scene,
     steps: Vec<StepRecord>,
     /// The last gripper command: what holding still means for it. Episodes begin with an open gripper.
     gripper: f32,
     video: Option<Video>,
     started: Instant,
+}
+
+/// What the verifier knows of an episode beside the candidates.
+#[derive(Debug, Clone, Default)]
+pub struct Scene {
+    /// What the robot was told.
+    pub instruction: String,
+    /// Where the gripper is: x and y in the base frame, metres.
+    pub gripper: [f32; 2],
+    /// What was said so far.
+    pub memory: Memory,
 }
 
 /// A session on a server.
@@ -71,18 +82,9 @@ impl Attempt {
             video.push(&image.pixels)?;
         }
         let instruction = observation.instruction.clone();
+        let scene = Scene { instruction, ..Scene::default() };
         let (steps, started) = (Vec::new(), Instant::now());
-        Ok(Attempt {
-            job,
-            seat,
-            episode,
-            verifier,
-            instruction,
-            steps,
-            gripper: 1.0,
-            video,
-            started,
-        })
+        Ok(Attempt { job, seat, episode, verifier, scene, steps, gripper: 1.0, video, started })
     }
 
     /// What is asked of the policy at this step.
@@ -97,9 +99,12 @@ impl Attempt {
         }
     }
 
-    /// The verifier's logits of the candidates.
-    pub fn score(&self, proposal: &Proposal, policy: &Policy) -> Option<Vec<f32>> {
-        self.verifier.as_ref().map(|verifier| score(verifier, proposal, policy))
+    /// The verifier's logits of the candidates; once per step, for what they say is remembered.
+    pub fn score(&mut self, proposal: &Proposal, policy: &Policy) -> Option<Vec<f32>> {
+        let [x, y, ..] = self.episode.observation().state;
+        self.scene.gripper = [x, y];
+        let verifier = self.verifier.as_ref()?;
+        Some(score(verifier, proposal, policy, &mut self.scene))
     }
 
     /// Chooses a candidate, notes the step, and says what to do.
@@ -127,6 +132,7 @@ impl Attempt {
             candidate_record(candidate, logits.as_ref().map(|logits| logits[index]), keep_hidden)
         });
         self.steps.push(StepRecord {
+            state: self.episode.observation().state,
             candidates: records.collect(),
             chosen: chosen.map(|index| index as u32),
             statistics: protocol::Statistics::default(),
@@ -168,7 +174,7 @@ impl Attempt {
                 policy: policy.to_owned(),
                 verifier: self.verifier.map(|verifier| verifier.digest().to_owned()),
             },
-            instruction: self.instruction,
+            instruction: self.scene.instruction,
             statistics,
             steps: self.steps,
             wall_secs: self.started.elapsed().as_secs_f32(),
@@ -190,17 +196,31 @@ pub struct Finished {
     pub episode: Episode,
 }
 
-/// The verifier's logits of a proposal's candidates.
-pub fn score(verifier: &Verifier, proposal: &Proposal, policy: &Policy) -> Vec<f32> {
+/// The verifier's logits of a proposal's candidates; the scene remembers what they say.
+pub fn score(
+    verifier: &Verifier,
+    proposal: &Proposal,
+    policy: &Policy,
+    scene: &mut Scene,
+) -> Vec<f32> {
     let hidden: Vec<&[f32]> = proposal.candidates.iter().map(|one| &*one.hidden).collect();
     let sibling = |candidate: &Candidate| {
         let action = candidate_action(candidate)?;
         let Candidate { tokens, log_probabilities, .. } = candidate;
-        Some(Sibling { action, confidence: policy.confidence(tokens, log_probabilities) })
+        let words = candidate.parsed.as_ref().ok().and_then(|parsed| Words::of(&parsed.reasoning));
+        let confidence = policy.confidence(tokens, log_probabilities);
+        Some(Sibling { action, confidence, words })
     };
     let candidates: Vec<Option<Sibling>> = proposal.candidates.iter().map(sibling).collect();
-    let action_scale = &policy.action_scale();
-    verifier.logits(&Siblings { hidden: &hidden, candidates: &candidates, action_scale })
+    let words: Vec<Words> = candidates.iter().flatten().filter_map(|one| one.words).collect();
+    verifier.logits(&Siblings {
+        hidden: &hidden,
+        candidates: &candidates,
+        action_scale: &policy.action_scale(),
+        instruction: &scene.instruction,
+        gripper: scene.gripper,
+        outlook: scene.memory.note(&words),
+    })
 }
 
 /// What a candidate would do; none when it is malformed.

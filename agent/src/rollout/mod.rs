@@ -17,7 +17,7 @@ use protocol::{Reset, Transition, VerifierUpdate};
 use tokio::sync::watch;
 use tokio::task::{JoinSet, block_in_place};
 
-pub use attempt::{Keep, Seat, candidate_action, score};
+pub use attempt::{Keep, Scene, Seat, candidate_action, score};
 pub use crew::Crew;
 pub use journal::Journal;
 pub use queue::{ATTEMPTS_MAX, Job, Queue};
@@ -75,7 +75,7 @@ impl Rollout<'_> {
             }
             let begun = Instant::now();
             let proposals = self.propose(&attempts)?;
-            let logits = self.score(&attempts, &proposals);
+            let logits = self.score(&mut attempts, &proposals);
             let actions = self.choose(&mut attempts, proposals, logits);
             let decision_ms = milliseconds_since(begun);
             attempts = self.step(attempts, actions, decision_ms).await?;
@@ -115,8 +115,8 @@ impl Rollout<'_> {
         block_in_place(|| self.policy.propose(&requests))
     }
 
-    fn score(&self, attempts: &[Attempt], proposals: &[Proposal]) -> Vec<Option<Vec<f32>>> {
-        let decisions = attempts.iter().zip(proposals);
+    fn score(&self, attempts: &mut [Attempt], proposals: &[Proposal]) -> Vec<Option<Vec<f32>>> {
+        let decisions = attempts.iter_mut().zip(proposals);
         decisions.map(|(attempt, proposal)| attempt.score(proposal, self.policy)).collect()
     }
 

@@ -29,6 +29,8 @@ const WEIGHT_DECAY: f64 = 0.1;
 pub struct Lesson<'a> {
     /// Its task.
     pub task: &'a str,
+    /// What the robot was told.
+    pub instruction: &'a str,
     /// Its outcome.
     pub is_success: bool,
     /// Its decisions.
@@ -40,9 +42,9 @@ pub struct Lesson<'a> {
 impl Lesson<'_> {
     /// The lesson of an episode that has decisions.
     fn of(episode: &LabelledEpisode) -> Option<Lesson<'_>> {
-        let LabelledEpisode { task, is_success, decisions, .. } = episode;
+        let LabelledEpisode { task, instruction, is_success, decisions, .. } = episode;
         let decisions = decisions.as_deref().filter(|decisions| !decisions.is_empty())?;
-        Some(Lesson { task, is_success: *is_success, decisions, fold: 0 })
+        Some(Lesson { task, instruction, is_success: *is_success, decisions, fold: 0 })
     }
 }
 

@@ -7,8 +7,13 @@
 use anyhow::Result;
 
 use super::advantage::{FOLDS, Lesson, advantages, lessons};
+use super::aim;
+use super::decision::DecisionSample;
 use super::set::TrainingSet;
-use crate::verifier::{Choice, ChoiceEvidence, FEATURES, Features, Gain, Options, PENALTIES};
+use crate::verifier::{
+    AIM, Aims, Choice, ChoiceEvidence, FEATURES, Features, Gain, NEARNESS, Options, PENALTIES,
+    retarget,
+};
 
 /// Fewer episodes teach nothing about single decisions.
 const EPISODES_MIN: usize = 20;
@@ -17,6 +22,9 @@ const SCALE_MIN: f64 = 1e-6;
 /// Rounds of coordinate descent: far more than so few weights take to settle, and still only milliseconds.
 const ROUNDS: usize = 1000;
 
+/// The features of every decision's candidates, lesson by lesson.
+type Rows = Vec<Vec<Vec<Features>>>;
+
 /// The choice part of all episodes with decisions, and what it is worth; none when there are too few of them.
 pub fn fit(set: &TrainingSet, options: &Options) -> Result<Option<(Choice, ChoiceEvidence)>> {
     let lessons = lessons(set.episodes(), options.seed);
@@ -24,41 +32,56 @@ pub fn fit(set: &TrainingSet, options: &Options) -> Result<Option<(Choice, Choic
         return Ok(None);
     }
     let advantages = advantages(&lessons, options.advantage_decay, options.seed)?;
+    let rows = rows(&lessons)?;
     let fit = |is_used: &dyn Fn(&Lesson<'_>) -> bool| {
-        regress(&lessons, &advantages, is_used, options.choice_ridge)
+        let used = lessons.iter().zip(&rows).zip(&advantages);
+        let used = used.filter(|((lesson, _), _)| is_used(lesson));
+        let executed = used.flat_map(|((_, rows), advantages)| {
+            rows.iter().map(|row| &row[0]).zip(advantages.iter().copied())
+        });
+        regress(&executed.collect::<Vec<_>>(), options.choice_ridge)
     };
-    let others = |fold: usize| fit(&|lesson: &Lesson<'_>| lesson.fold != fold);
-    let folds: Vec<Choice> = (0..FOLDS).map(others).collect::<Result<_>>()?;
+    let folds: Vec<Features> =
+        (0..FOLDS).map(|fold| fit(&|lesson: &Lesson<'_>| lesson.fold != fold)).collect();
     let evidence = ChoiceEvidence {
         episodes: lessons.len(),
         decisions: lessons.iter().map(|lesson| lesson.decisions.len()).sum(),
-        gain: gain(&lessons, &advantages, |lesson, features| {
-            folds[lesson.fold].advantage(features)
+        gain: gain(&lessons, &rows, &advantages, |lesson, features| {
+            let weights = &folds[lesson.fold];
+            weights.iter().zip(features).map(|(weight, value)| weight * value).sum()
         }),
-        medoid_gain: gain(&lessons, &advantages, |_, features| features[FEATURES - 1]),
+        medoid_gain: gain(&lessons, &rows, &advantages, |_, features| features[NEARNESS]),
     };
-    Ok(Some((fit(&|_| true)?, evidence)))
+    let mut weights = fit(&|_| true);
+    weights[AIM].iter_mut().for_each(|weight| *weight *= options.aim_factor as f32);
+    let choice = Choice::new(weights, aim::fit(&lessons, |_| true)?)?;
+    Ok(Some((choice, evidence)))
+}
+
+/// With targets that were learnt from the lessons of the other folds: of its own ones a target knows too much.
+fn rows(lessons: &[Lesson<'_>]) -> Result<Rows> {
+    let others = |fold: usize| aim::fit(lessons, |lesson| lesson.fold != fold);
+    let aims: Vec<Aims> = (0..FOLDS).map(others).collect::<Result<_>>()?;
+    let rows = lessons.iter().map(|lesson| {
+        let decisions = lesson.decisions.iter().map(|decision| {
+            let DecisionSample { candidates, actions, gripper, outlook, .. } = decision;
+            let target = aims[lesson.fold].target(lesson.instruction, outlook, *gripper);
+            let mut candidates = candidates.clone();
+            retarget(&mut candidates, actions, target);
+            candidates
+        });
+        decisions.collect()
+    });
+    Ok(rows.collect())
 }
 
 /// Ridge regression of advantages on the executed candidates' standardised features.
-fn regress(
-    lessons: &[Lesson<'_>],
-    advantages: &[Vec<f64>],
-    is_used: &dyn Fn(&Lesson<'_>) -> bool,
-    ridge: f64,
-) -> Result<Choice> {
-    let used = lessons.iter().zip(advantages).filter(|(lesson, _)| is_used(lesson));
-    let samples: Vec<(&Features, f64)> = used
-        .flat_map(|(lesson, advantages)| {
-            let executed = lesson.decisions.iter().map(|decision| &decision.candidates[0]);
-            executed.zip(advantages.iter().copied())
-        })
-        .collect();
+fn regress(samples: &[(&Features, f64)], ridge: f64) -> Features {
     let count = samples.len().max(1) as f64;
-    let scales = scales(&samples);
+    let scales = scales(samples);
     let mut squares = [[0.0; FEATURES]; FEATURES];
     let mut products = [0.0; FEATURES];
-    for (features, advantage) in &samples {
+    for (features, advantage) in samples {
         let row: [f64; FEATURES] =
             std::array::from_fn(|index| f64::from(features[index]) / scales[index]);
         for (left, squares) in row.iter().zip(&mut squares) {
@@ -67,7 +90,7 @@ fn regress(
         products.iter_mut().zip(row).for_each(|(sum, value)| *sum += value * advantage / count);
     }
     let weights = descend(&squares, &products, ridge);
-    Choice::new(std::array::from_fn(|index| (weights[index] / scales[index]) as f32))
+    std::array::from_fn(|index| (weights[index] / scales[index]) as f32)
 }
 
 /// The weights of least squared error plus ridge, each on its side of 0, by coordinate descent.
@@ -106,23 +129,25 @@ fn scales(samples: &[(&Features, f64)]) -> [f64; FEATURES] {
 /// times as there were candidates: an estimate without bias for a single decision.
 fn gain(
     lessons: &[Lesson<'_>],
+    rows: &Rows,
     advantages: &[Vec<f64>],
     score: impl Fn(&Lesson<'_>, &Features) -> f32,
 ) -> Gain {
-    let episode = |(lesson, advantages): (&Lesson<'_>, &Vec<f64>)| -> f64 {
-        let decisions = lesson.decisions.iter().zip(advantages);
-        decisions
-            .map(|(decision, advantage)| {
-                let scores = decision.candidates.iter().map(|features| score(lesson, features));
-                let scores: Vec<f32> = scores.collect();
-                let largest = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-                let ties = scores.iter().filter(|score| **score == largest).count() as f64;
-                let is_best = f64::from(u8::from(scores[0] == largest));
-                (is_best * scores.len() as f64 / ties - 1.0) * advantage * 100.0
-            })
-            .sum()
-    };
-    let episodes: Vec<f64> = lessons.iter().zip(advantages).map(episode).collect();
+    let episode =
+        |((lesson, rows), advantages): ((&Lesson<'_>, &Vec<Vec<Features>>), &Vec<f64>)| {
+            rows.iter()
+                .zip(advantages)
+                .map(|(candidates, advantage)| {
+                    let scores = candidates.iter().map(|features| score(lesson, features));
+                    let scores: Vec<f32> = scores.collect();
+                    let largest = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+                    let ties = scores.iter().filter(|score| **score == largest).count() as f64;
+                    let is_best = f64::from(u8::from(scores[0] == largest));
+                    (is_best * scores.len() as f64 / ties - 1.0) * advantage * 100.0
+                })
+                .sum::<f64>()
+        };
+    let episodes: Vec<f64> = lessons.iter().zip(rows).zip(advantages).map(episode).collect();
     let count = episodes.len() as f64;
     let points = episodes.iter().sum::<f64>() / count;
     let squares: f64 = episodes.iter().map(|value| (value - points).powi(2)).sum();
@@ -135,7 +160,7 @@ mod tests {
     use crate::policy::PARTS;
     use crate::strategy::CandidateAction;
     use crate::training::{DecisionSample, LabelledEpisode, STATISTICS};
-    use crate::verifier::{Sibling, features};
+    use crate::verifier::{Outlook, Sibling, features};
     use rand::rngs::StdRng;
     use rand::{Rng, SeedableRng};
 
@@ -153,22 +178,26 @@ mod tests {
                         confidence[4] = random.random_range(-1.0..0.0_f32);
                         confidence[6] = random.random_range(-2.0..0.0_f32);
                         let action = CandidateAction { tokens: [500; 7], action: [0.0; 7] };
-                        Some(Sibling { action, confidence })
+                        Some(Sibling { action, confidence, words: None })
                     };
                     let siblings: Vec<_> = (0..5).map(|_| sibling()).collect();
                     let candidates: Vec<Features> =
-                        features(&siblings, &[1.0; 7]).into_iter().flatten().collect();
+                        features(&siblings, &[1.0; 7], None).into_iter().flatten().collect();
                     sum += f64::from(candidates[0][6] - candidates[0][4]);
                     DecisionSample {
                         hidden_mean: vec![0.5, 0.25],
                         statistics: [0.0; STATISTICS],
+                        actions: vec![[0.0; 7]; candidates.len()],
                         candidates,
+                        gripper: [0.0; 2],
+                        outlook: Outlook::default(),
                     }
                 })
                 .collect();
             LabelledEpisode {
                 name: format!("episode {number:04}"),
                 task: "widowx_stack_cube".to_owned(),
+                instruction: "stack".to_owned(),
                 is_success: random.random_bool(1.0 / (1.0 + (-strength * sum).exp())),
                 hidden: vec![0.5; 40],
                 steps: (0..20).collect(),

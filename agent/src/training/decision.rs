@@ -6,7 +6,7 @@ use protocol::Statistics;
 use super::records::Reader;
 use crate::record::{CandidateRecord, StepRecord, hidden_from_bytes};
 use crate::strategy::CandidateAction;
-use crate::verifier::{Features, Sibling, features, mean_hidden};
+use crate::verifier::{Features, Memory, Outlook, Sibling, Words, features, mean_hidden};
 
 /// One decision in which the executed candidate was drawn, not chosen.
 #[derive(Clone, Debug, PartialEq)]
@@ -15,21 +15,37 @@ pub struct DecisionSample {
     pub hidden_mean: Vec<f32>,
     /// What the simulator had said after the step before, as 0 or 1; the verifier never sees it.
     pub statistics: [f32; STATISTICS],
-    /// How each well-formed candidate differs from the others; the first was executed.
+    /// How each well-formed candidate differs from the others, without a target; the first was executed.
     pub candidates: Vec<Features>,
+    /// What each of them would do.
+    pub actions: Vec<[f32; 7]>,
+    /// Where the gripper was: x and y in the base frame, metres.
+    pub gripper: [f32; 2],
+    /// What had been said until then.
+    pub outlook: Outlook,
+}
+
+impl DecisionSample {
+    /// Whether the simulator had said that the object was in the gripper.
+    pub fn is_grasped(&self) -> bool {
+        self.statistics[1] > 0.5
+    }
 }
 
 /// Flags of [`protocol::Statistics`].
 pub const STATISTICS: usize = 9;
 
-/// What a step's decision was between; none when hidden states of well-formed candidates were not kept.
+/// What a step's decision was between, remembering what was said; none when hidden states of well-formed candidates were not kept.
 pub fn read(
     step: &StepRecord,
     before: Statistics,
+    memory: &mut Memory,
     reader: Reader<'_>,
 ) -> anyhow::Result<Option<DecisionSample>> {
     let siblings = step.candidates.iter().map(|candidate| sibling(candidate, reader));
     let siblings = siblings.collect::<anyhow::Result<Vec<_>>>()?;
+    let words: Vec<Words> = siblings.iter().flatten().filter_map(|one| one.words).collect();
+    let outlook = memory.note(&words);
     let well_formed = step.candidates.iter().filter(|candidate| candidate.action.is_some());
     let Some(bytes) = well_formed.map(|one| one.hidden.as_ref()).collect::<Option<Vec<_>>>() else {
         return Ok(None);
@@ -42,11 +58,15 @@ pub fn read(
         "expected hidden states of one size, got several"
     );
     let rows: Vec<&[f32]> = rows.iter().map(Vec::as_slice).collect();
-    let candidates = features(&siblings, reader.action_scale).into_iter().flatten().collect();
+    let candidates = features(&siblings, reader.action_scale, None).into_iter().flatten().collect();
+    let [x, y, ..] = step.state;
     Ok(Some(DecisionSample {
         hidden_mean: mean_hidden(&rows, size),
         statistics: flags(before),
         candidates,
+        actions: siblings.iter().flatten().map(|one| one.action.action).collect(),
+        gripper: [x, y],
+        outlook,
     }))
 }
 
@@ -66,6 +86,7 @@ fn sibling(candidate: &CandidateRecord, reader: Reader<'_>) -> anyhow::Result<Op
     Ok(Some(Sibling {
         action: CandidateAction { tokens: *action_tokens, action },
         confidence: (reader.confidence)(tokens, log_probabilities),
+        words: (reader.words)(tokens),
     }))
 }
 

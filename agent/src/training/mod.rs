@@ -2,10 +2,12 @@
 //!
 //! ```text
 //! hidden states, outcomes ─▶ network, by equation 4: how promising a situation is
+//! grasps, places of successes ─▶ aim: where the gripper should go, by what was said
 //! siblings of drawn candidates ─▶ critic ─▶ advantages ─▶ choice: which candidate is better
 //! ```
 
 mod advantage;
+mod aim;
 mod choice;
 mod decision;
 mod learner;
@@ -113,7 +115,7 @@ pub fn train(
 
 fn check(options: &Options) -> anyhow::Result<()> {
     let Options { hidden_sizes, epochs_max, batch_samples, learning_rate, .. } = options;
-    let Options { held_out_share, advantage_decay, choice_ridge, .. } = options;
+    let Options { held_out_share, advantage_decay, choice_ridge, aim_factor, .. } = options;
     ensure!(
         hidden_sizes.iter().all(|size| (1..=4096).contains(size)),
         "hidden sizes: expected 1 to 4096, got {hidden_sizes:?}"
@@ -135,6 +137,10 @@ fn check(options: &Options) -> anyhow::Result<()> {
     ensure!(
         choice_ridge.is_finite() && *choice_ridge > 0.0,
         "choice ridge: expected more than 0, got {choice_ridge}"
+    );
+    ensure!(
+        aim_factor.is_finite() && *aim_factor >= 0.0,
+        "aim factor: expected 0 or more, got {aim_factor}"
     );
     Ok(())
 }
@@ -202,7 +208,7 @@ fn score(set: &TrainingSet, episodes: &[usize], network: &Network) -> HeldOut {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::verifier::Siblings;
+    use crate::verifier::{Outlook, Siblings};
     use rand::Rng;
 
     /// Episodes of two tasks whose success shows, noisily, in the second of four features; the rest is noise.
@@ -223,6 +229,7 @@ mod tests {
             LabelledEpisode {
                 name: format!("episode {number}"),
                 task,
+                instruction: String::new(),
                 is_success,
                 hidden,
                 steps,
@@ -262,6 +269,9 @@ mod tests {
             hidden: &[&[5.0, 9.0, 5.0, 5.0], &[5.0, 1.0, 5.0, 5.0]],
             candidates: &[None, None],
             action_scale: &[1.0; 7],
+            instruction: "",
+            gripper: [0.0; 2],
+            outlook: Outlook::default(),
         });
         assert!(logits[0] > 1.0 && logits[1] < -1.0, "{logits:?}");
     }

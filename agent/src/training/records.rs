@@ -14,6 +14,7 @@ use crate::record::{EpisodeRecord, hidden_from_bytes};
 use crate::run::{record_path, recorded};
 use crate::strategy::Strategy;
 use crate::suite::SeedRange;
+use crate::verifier::{Memory, Words};
 
 /// What records are read for.
 #[derive(Clone, Copy)]
@@ -24,6 +25,8 @@ pub struct Reader<'a> {
     pub action_scale: &'a [f32; 7],
     /// How sure it was of a candidate's parts, from tokens and log-probabilities.
     pub confidence: &'a dyn Fn(&[u32], &[f32]) -> Confidence,
+    /// Where a candidate sees what, from its tokens.
+    pub words: &'a dyn Fn(&[u32]) -> Option<Words>,
 }
 
 /// Why an episode must not teach the verifier of a policy.
@@ -172,7 +175,7 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
     // A chosen candidate would make a good choice look like a good candidate.
     let is_drawn = record.identity.strategy == Strategy::Sample.name();
     let mut decisions = (is_drawn && record.identity.candidates > 1).then(Vec::new);
-    let mut statistics = Statistics::default();
+    let (mut statistics, mut memory) = (Statistics::default(), Memory::default());
     for (index, step) in record.steps.iter().enumerate() {
         let before = std::mem::replace(&mut statistics, step.statistics);
         // The robot held still: nothing that the policy said was executed.
@@ -185,7 +188,7 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
         hidden.extend(hidden_from_bytes(bytes).with_context(|| format!("step {index}"))?);
         steps.push(index);
         if let Some(list) = &mut decisions {
-            let sample = decision::read(step, before, reader);
+            let sample = decision::read(step, before, &mut memory, reader);
             match sample.with_context(|| format!("step {index}"))? {
                 Some(sample) if chosen == 0 => list.push(sample),
                 _ => decisions = None,
@@ -195,6 +198,7 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
     Ok(LabelledEpisode {
         name: format!("{}/{}", record.identity.run, record.identity.id()),
         task: record.identity.task.clone(),
+        instruction: record.instruction.clone(),
         is_success: record.statistics.is_success,
         hidden,
         steps,
@@ -223,6 +227,7 @@ mod tests {
             confidence[0] = log_probabilities[0];
             confidence
         },
+        words: &|_| None,
     };
 
     /// Three steps with two candidates each; the second is executed, except in the last step, in which none is.
@@ -237,6 +242,7 @@ mod tests {
             hidden: Some(hidden_to_bytes(&[value, 0.5])),
         };
         let step = |index: usize| StepRecord {
+            state: [0.0; 8],
             candidates: vec![candidate(-9.0), candidate(index as f32)],
             chosen: (index < 2).then_some(1),
             statistics: Statistics::default(),

@@ -16,6 +16,8 @@ pub struct LabelledEpisode {
     pub name: String,
     /// Its task.
     pub task: String,
+    /// What the robot was told.
+    pub instruction: String,
     /// Its outcome at the last step: the label of all its samples.
     pub is_success: bool,
     /// (samples, input size), row by row: the executed candidates' last hidden states.
@@ -135,6 +137,7 @@ mod tests {
         LabelledEpisode {
             name: name.to_owned(),
             task: task.to_owned(),
+            instruction: String::new(),
             is_success,
             hidden: vec![0.5; 6],
             steps: vec![0, 1, 2],

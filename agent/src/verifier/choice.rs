@@ -2,20 +2,26 @@
 //!
 //! The score of a hidden state mostly says how promising the situation is, which is the same for all candidates of one
 //! decision. This part looks only at what differs between them: how sure the policy was of each part of the reasoning and
-//! of the action, and how far the action is from those of its siblings. It is linear, because one action changes an
+//! of the action, how far the action is from those of its siblings, and how near it brings the gripper to where all the
+//! words so far say that it should go. It is linear, because one action changes an
 //! episode's outcome by little and only few numbers can be learnt from that.
 
 use std::ops::Range;
 
 use anyhow::ensure;
 
+use super::aim::{Aims, STAGES, Target, Words};
 use crate::policy::{Confidence, PARTS};
 use crate::strategy::{CandidateAction, distance_mean};
 
 /// Numbers of an action.
 const NUMBERS: usize = 7;
-/// Log-probabilities of the parts, sizes of the deviations, and the nearness to the siblings.
-pub const FEATURES: usize = PARTS + NUMBERS + 1;
+/// The nearness to the siblings, whose largest is the medoid's.
+pub const NEARNESS: usize = PARTS + NUMBERS;
+/// The nearness to the target, one for each stage.
+pub const AIM: Range<usize> = NEARNESS + 1..NEARNESS + 1 + STAGES;
+/// Log-probabilities of the parts, sizes of the deviations, nearness to the siblings and to the target.
+pub const FEATURES: usize = AIM.end;
 
 /// Features of which more is never better: the sizes of the deviations. Of all others less is never better.
 pub const PENALTIES: Range<usize> = PARTS..PARTS + NUMBERS;
@@ -30,22 +36,26 @@ pub struct Sibling {
     pub action: CandidateAction,
     /// How sure the policy was of its parts.
     pub confidence: Confidence,
+    /// Where it sees what; none when it does not say.
+    pub words: Option<Words>,
 }
 
-/// The learnt weights: the change of the probability of success per unit of each feature.
+/// What has been learnt of choosing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Choice {
+    /// The change of the probability of success per unit of each feature.
     weights: Features,
+    aims: Aims,
 }
 
 impl Choice {
     /// Refuses weights that are not numbers.
-    pub fn new(weights: Features) -> anyhow::Result<Choice> {
+    pub fn new(weights: Features, aims: Aims) -> anyhow::Result<Choice> {
         ensure!(
             weights.iter().all(|weight| weight.is_finite()),
             "choice weights: expected finite values, got NaN or infinity"
         );
-        Ok(Choice { weights })
+        Ok(Choice { weights, aims })
     }
 
     /// One for each feature.
@@ -53,9 +63,26 @@ impl Choice {
         &self.weights
     }
 
+    /// Where the gripper should go.
+    pub fn aims(&self) -> &Aims {
+        &self.aims
+    }
+
     /// The change of the probability of success that a candidate brings, against the mean of its siblings.
     pub fn advantage(&self, features: &Features) -> f32 {
         self.weights.iter().zip(features).map(|(weight, value)| weight * value).sum()
+    }
+}
+
+/// The same features with another target; `actions` are those of the candidates.
+pub fn retarget(features: &mut [Features], actions: &[[f32; NUMBERS]], target: Option<Target>) {
+    let near = |target: Target| actions.iter().map(move |action| -target.distance(action));
+    let mean = target.map_or(0.0, |target| near(target).sum::<f32>() / actions.len() as f32);
+    for (features, action) in features.iter_mut().zip(actions) {
+        features[AIM].fill(0.0);
+        if let Some(target) = target {
+            features[AIM.start + target.stage as usize] = -target.distance(action) - mean;
+        }
     }
 }
 
@@ -66,6 +93,7 @@ impl Choice {
 pub fn features(
     siblings: &[Option<Sibling>],
     action_scale: &[f32; NUMBERS],
+    target: Option<Target>,
 ) -> Vec<Option<Features>> {
     let candidates: Vec<Option<CandidateAction>> =
         siblings.iter().map(|sibling| sibling.as_ref().map(|sibling| sibling.action)).collect();
@@ -78,14 +106,17 @@ pub fn features(
     let action_mean: [f32; NUMBERS] =
         mean(&candidates.iter().flatten().map(scaled).collect::<Vec<_>>());
     let raw = siblings.iter().enumerate().map(|(index, sibling)| {
-        let Sibling { action, confidence } = sibling.as_ref()?;
+        let Sibling { action, confidence, .. } = sibling.as_ref()?;
         let mut features = [0.0; FEATURES];
         let (parts, deviations) = features.split_at_mut(PARTS);
         parts.copy_from_slice(confidence);
         for (number, value) in scaled(action).iter().enumerate() {
             deviations[number] = (value - action_mean[number]).abs();
         }
-        deviations[NUMBERS] = -distance_mean(&candidates, index, action) as f32;
+        features[NEARNESS] = -distance_mean(&candidates, index, action) as f32;
+        if let Some(target) = target {
+            features[AIM.start + target.stage as usize] = -target.distance(&action.action);
+        }
         Some(features)
     });
     let raw: Vec<Option<Features>> = raw.collect();
@@ -106,6 +137,7 @@ fn mean<const SIZE: usize>(rows: &[[f32; SIZE]]) -> [f32; SIZE] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::verifier::Stage;
 
     const SCALE: [f32; 7] = [0.1, 0.1, 0.1, 0.0, 0.1, 0.1, 2.0];
 
@@ -114,13 +146,14 @@ mod tests {
         let action = CandidateAction { tokens, action: [x, 0.0, 0.0, 9.0, 0.0, 0.0, gripper] };
         let mut confidence = [0.0; PARTS];
         confidence[2] = -10.0 * x;
-        Some(Sibling { action, confidence })
+        Some(Sibling { action, confidence, words: None })
     }
 
     #[test]
     fn features_are_relative_to_the_siblings() {
         let candidates = [at(0.1, 500, 1.0), None, at(0.3, 551, 1.0), at(0.2, 500, -1.0)];
-        let rows = features(&candidates, &SCALE);
+        let target = Target { stage: Stage::Place, offset: [0.2, 0.0] };
+        let rows = features(&candidates, &SCALE, Some(target));
         assert!(rows[1].is_none());
         let rows: Vec<Features> = rows.into_iter().flatten().collect();
         let check = |index: usize, expected: [f32; 3]| {
@@ -138,14 +171,26 @@ mod tests {
         check(PARTS + 6, [-1.0 / 9.0, -1.0 / 9.0, 2.0 / 9.0]);
         // Mean distances 0.6, 0.7 and 1.1 (51 bins are a fifth of the range, the other gripper side is 1).
         check(PARTS + 7, [0.2, 0.1, -0.3]);
+        // Nothing is grasped; 10, 10 and 0 cm from the place.
+        check(AIM.start, [0.0; 3]);
+        check(AIM.start + 1, [-0.1 / 3.0, -0.1 / 3.0, 0.2 / 3.0]);
+        let plain = features(&candidates, &SCALE, None).into_iter().flatten();
+        let mut plain: Vec<Features> = plain.collect();
+        assert_eq!(plain[2][AIM.start + 1], 0.0);
+        let actions: Vec<_> = candidates.iter().flatten().map(|one| one.action.action).collect();
+        retarget(&mut plain, &actions, Some(target));
+        let pairs = plain.as_flattened().iter().zip(rows.as_flattened());
+        assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-6));
+        retarget(&mut plain, &actions, None);
+        assert_eq!(plain[2][AIM.start + 1], 0.0);
     }
 
     #[test]
     fn a_lone_candidate_has_no_advantage() {
-        let choice = Choice::new([3.0; FEATURES]).expect("finite");
-        let rows = features(&[None, at(0.3, 551, -1.0)], &SCALE);
+        let choice = Choice::new([3.0; FEATURES], Aims::default()).expect("finite");
+        let rows = features(&[None, at(0.3, 551, -1.0)], &SCALE, None);
         assert_eq!(choice.advantage(&rows[1].expect("well formed")), 0.0);
-        assert!(features(&[None, None], &SCALE).iter().all(Option::is_none));
-        assert!(Choice::new([f32::NAN; FEATURES]).is_err());
+        assert!(features(&[None, None], &SCALE, None).iter().all(Option::is_none));
+        assert!(Choice::new([f32::NAN; FEATURES], Aims::default()).is_err());
     }
 }

@@ -31,7 +31,7 @@ pub struct ChoiceEvidence {
     pub episodes: usize,
     /// Their decisions.
     pub decisions: usize,
-    /// Of choosing the best candidate.
+    /// Of choosing the best candidate, with an aim factor of 1: a larger one pays only over many decisions.
     pub gain: Gain,
     /// Of choosing the medoid, by the same measure.
     pub medoid_gain: Gain,
@@ -75,6 +75,9 @@ pub struct Options {
     pub advantage_decay: f64,
     /// Ridge of the choice part's regression, in units of a standardised feature's variance.
     pub choice_ridge: f64,
+    /// What the weights of the nearness to the target are multiplied by. The regression sees what one decision does
+    /// while all later ones drift on; a gripper that is led by every decision keeps what it has gained.
+    pub aim_factor: f64,
 }
 
 impl Default for Options {
@@ -91,6 +94,7 @@ impl Default for Options {
             choice: true,
             advantage_decay: 0.95,
             choice_ridge: 0.12,
+            aim_factor: 4.0,
         }
     }
 }

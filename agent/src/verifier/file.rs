@@ -7,13 +7,18 @@ use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 
-use super::{Choice, Description, FEATURES, FILE_BYTES_MAX, Layer, Network, Standardisation};
+use super::{
+    Aims, Choice, Description, FEATURES, FILE_BYTES_MAX, Layer, Network, Place, Stage,
+    Standardisation, TERMS,
+};
 
 /// Metadata key of the description; one key, because the order of several would not be the same twice.
 const DESCRIPTION_KEY: &str = "rever.verifier";
 const MEAN: &str = "standardisation.mean";
 const DEVIATION: &str = "standardisation.deviation";
 const CHOICE: &str = "choice.weight";
+/// Followed by the instruction.
+const AIMS: [(Stage, &str); 2] = [(Stage::Grasp, "aim.grasp."), (Stage::Place, "aim.place.")];
 const LAYERS: [&str; 3] = ["hidden_1", "hidden_2", "output"];
 
 /// The bytes of a file: the same verifier always gives the same bytes.
@@ -35,6 +40,11 @@ pub fn encode(
     }
     if let Some(choice) = choice {
         tensors.push((CHOICE.to_owned(), vec![FEATURES], bytes_of(choice.weights())));
+        for (instruction, stage, place) in choice.aims().places() {
+            let name = format!("{}{instruction}", AIMS[stage as usize].1);
+            let numbers = place.coefficients().as_flattened();
+            tensors.push((name, vec![TERMS, 2], bytes_of(numbers)));
+        }
     }
     let views = tensors
         .iter()
@@ -63,8 +73,9 @@ pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Option<Choice>, Descript
         serde_json::from_str(description).context("verifier description")?;
 
     let tensors = SafeTensors::deserialize(bytes).context("verifier file: expected safetensors")?;
-    let choice_tensors = usize::from(description.choice.is_some());
-    let expected = 2 + 2 * LAYERS.len() + choice_tensors;
+    let has_choice = description.choice.is_some();
+    let aims = if has_choice { read_aims(&tensors)? } else { Aims::default() };
+    let expected = 2 + 2 * LAYERS.len() + usize::from(has_choice) + aims.places().count();
     ensure!(
         tensors.len() == expected,
         "verifier file: expected {expected} tensors, got {}",
@@ -92,11 +103,24 @@ pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Option<Choice>, Descript
     let choice = match &description.choice {
         Some(_) => {
             let weights = read(&tensors, CHOICE, &[FEATURES])?;
-            Some(Choice::new(weights.try_into().expect("one per feature"))?)
+            Some(Choice::new(weights.try_into().expect("one per feature"), aims)?)
         }
         None => None,
     };
     Ok((Network::new(standardisation, layers)?, choice, description))
+}
+
+fn read_aims(tensors: &SafeTensors<'_>) -> anyhow::Result<Aims> {
+    let mut aims = Aims::default();
+    for name in tensors.names() {
+        let found = AIMS.iter().find_map(|(stage, part)| Some((*stage, name.strip_prefix(part)?)));
+        let Some((stage, instruction)) = found else { continue };
+        let numbers = read(tensors, name, &[TERMS, 2])?;
+        let pairs = numbers.as_chunks::<2>().0;
+        let coefficients = pairs.try_into().expect("as many as terms");
+        aims.insert(instruction, stage, Place::new(coefficients).context(name.to_owned())?);
+    }
+    Ok(aims)
 }
 
 /// SHA-256 in hexadecimal.

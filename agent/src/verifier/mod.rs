@@ -3,8 +3,10 @@
 //! ```text
 //! last hidden states ─▶ mean ─▶ network (equation 4): how promising the situation is ─┐
 //! log-probabilities, actions ─▶ against the siblings ─▶ choice: which is better ──────┴▶ logit of each
+//! where it sees the objects, all steps so far ─▶ aim: where the gripper should go ─┘
 //! ```
 
+mod aim;
 mod choice;
 mod description;
 mod file;
@@ -15,7 +17,10 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 
-pub use choice::{Choice, FEATURES, Features, PENALTIES, Sibling, features};
+pub use aim::{Aims, Bounds, Memory, Outlook, Place, STAGES, Stage, TERMS, Target, Words, terms};
+pub use choice::{
+    AIM, Choice, FEATURES, Features, NEARNESS, PENALTIES, Sibling, features, retarget,
+};
 pub use description::{ChoiceEvidence, Description, Evidence, Gain, Options};
 pub use metrics::{Discrimination, HeldOut, Metrics, weighted_loss};
 pub use network::{Layer, Network, Standardisation};
@@ -35,6 +40,12 @@ pub struct Siblings<'a> {
     pub candidates: &'a [Option<Sibling>],
     /// One unit of each number of an action.
     pub action_scale: &'a [f32; 7],
+    /// What the robot was told.
+    pub instruction: &'a str,
+    /// Where the gripper is: x and y in the base frame, metres.
+    pub gripper: [f32; 2],
+    /// What was said in this episode, these candidates included.
+    pub outlook: Outlook,
 }
 
 /// A trained verifier for one policy.
@@ -112,7 +123,7 @@ impl Verifier {
     /// mean hidden state, so that it cannot prefer the candidate that merely claims more progress, and the choice part
     /// tells the candidates apart. A malformed candidate's logit means nothing.
     pub fn logits(&self, siblings: &Siblings<'_>) -> Vec<f32> {
-        let Siblings { hidden, candidates, action_scale } = siblings;
+        let Siblings { hidden, candidates, action_scale, instruction, gripper, outlook } = siblings;
         assert_eq!(hidden.len(), candidates.len(), "one hidden state per candidate");
         let Some(choice) = &self.choice else {
             return hidden.iter().map(|row| self.network.logit(row)).collect();
@@ -124,7 +135,8 @@ impl Verifier {
             let advantage = features.map_or(0.0, |features| choice.advantage(&features));
             situation + LOGITS_PER_PROBABILITY * advantage
         };
-        features(candidates, action_scale).into_iter().map(logit).collect()
+        let target = choice.aims().target(instruction, outlook, *gripper);
+        features(candidates, action_scale, target).into_iter().map(logit).collect()
     }
 }
 
@@ -180,7 +192,10 @@ mod tests {
         let plain = arbitrary(seed);
         let mut weights = [0.0; FEATURES];
         weights[0] = 0.25;
-        let choice = Choice::new(weights).expect("finite");
+        let mut aims = Aims::default();
+        let place = Place::new([[0.25, -0.5]; TERMS]).expect("finite");
+        aims.insert("stack the green block", Stage::Place, place);
+        let choice = Choice::new(weights, aims).expect("finite");
         let gain = Gain { points: 1.0, standard_error: 0.5 };
         let (gain, medoid_gain) = (gain.clone(), gain);
         let evidence = ChoiceEvidence { episodes: 2, decisions: 20, gain, medoid_gain };
@@ -193,13 +208,23 @@ mod tests {
         let action = CandidateAction { tokens: [500; 7], action: [0.0; 7] };
         let mut confidence = [0.0; crate::policy::PARTS];
         confidence[0] = log_probability;
-        Some(Sibling { action, confidence })
+        Some(Sibling { action, confidence, words: None })
     }
 
     /// Logits of hidden states whose candidates are alike.
     fn alike(verifier: &Verifier, hidden: &[&[f32]]) -> Vec<f32> {
-        let candidates = vec![sure(-1.0); hidden.len()];
-        verifier.logits(&Siblings { hidden, candidates: &candidates, action_scale: &[1.0; 7] })
+        logits(verifier, hidden, &vec![sure(-1.0); hidden.len()])
+    }
+
+    fn logits(verifier: &Verifier, hidden: &[&[f32]], candidates: &[Option<Sibling>]) -> Vec<f32> {
+        verifier.logits(&Siblings {
+            hidden,
+            candidates,
+            action_scale: &[1.0; 7],
+            instruction: "",
+            gripper: [0.0; 2],
+            outlook: Outlook::default(),
+        })
     }
 
     #[test]
@@ -208,11 +233,7 @@ mod tests {
         let rows: [&[f32]; 3] = [&[0.1; 5], &[9.0; 5], &[0.5; 5]];
         // The second is malformed: its hidden state must not count.
         let candidates = [sure(-2.0), None, sure(-1.0)];
-        let logits = verifier.logits(&Siblings {
-            hidden: &rows,
-            candidates: &candidates,
-            action_scale: &[1.0; 7],
-        });
+        let logits = logits(&verifier, &rows, &candidates);
         let situation = verifier.network.logit(&[0.3; 5]);
         // Half a nat off the mean: 4 logits per probability x 0.25 x 0.5.
         for (found, expected) in logits.iter().zip([situation - 0.5, situation, situation + 0.5]) {
