@@ -64,6 +64,7 @@ fn verifier(policy: &Policy, seed: u64) -> Verifier {
         let value = |index: usize| ((index * 7919 + number * 104_729) % 1000) as f32 / 1000.0;
         LabelledEpisode {
             name: format!("episode {number}"),
+            instruction: String::new(),
             task: "widowx_spoon_on_towel".to_owned(),
             is_success: number % 2 == 0,
             hidden: (0..size).map(value).collect(),

@@ -306,11 +306,11 @@ pub(crate) mod tests {
         let bytes = rmp_serde::to_vec_named(&made_up(0)).expect("bytes");
         check(&bytes[..bytes.len() - 1], "is not an episode record");
         check(&[&bytes[..], &[0]].concat(), "expected one record, got 1 bytes after it");
-        let later = EpisodeRecord { version: 3, ..made_up(0) };
-        check(&rmp_serde::to_vec_named(&later).expect("bytes"), "expected record version 2, got 3");
+        let later = EpisodeRecord { version: 4, ..made_up(0) };
+        check(&rmp_serde::to_vec_named(&later).expect("bytes"), "expected record version 3, got 4");
         // A record of the first version, which had no log-probabilities of tokens.
         let first = serde_json::json!({"version": 1, "steps": [{"log_probability": -3.5}]});
-        check(&rmp_serde::to_vec_named(&first).expect("bytes"), "expected record version 2, got 1");
+        check(&rmp_serde::to_vec_named(&first).expect("bytes"), "expected record version 3, got 1");
     }
 
     #[test]

@@ -69,19 +69,24 @@ fn distance((terms, gripper): &Moment, coefficients: &[[f64; 2]; TERMS]) -> f64 
 /// Coefficients of least squared distance plus ridge, by Cholesky factors of the normal equations.
 fn solve(moments: &[&Moment]) -> [[f64; 2]; TERMS] {
     let mut squares = [[0.0; TERMS]; TERMS];
-    let mut products = [[0.0; 2]; TERMS];
+    let mut products = [[0.0; TERMS]; 2];
     for (terms, gripper) in moments {
-        for row in 0..TERMS {
-            for column in 0..TERMS {
-                squares[row][column] += terms[row] * terms[column];
-            }
-            for axis in 0..2 {
-                products[row][axis] += terms[row] * gripper[axis];
-            }
+        for (row, left) in squares.iter_mut().zip(terms) {
+            row.iter_mut().zip(terms).for_each(|(sum, right)| *sum += left * right);
+        }
+        for (products, place) in products.iter_mut().zip(gripper) {
+            products.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term * place);
         }
     }
     // The constant is free.
     (1..TERMS).for_each(|term| squares[term][term] += RIDGE);
+    let lower = factor(squares);
+    let [x, y] = products.map(|products| substitute(&lower, products));
+    std::array::from_fn(|term| [x[term], y[term]])
+}
+
+/// The lower triangle L with L L' = `squares`; what stands above it means nothing.
+fn factor(mut squares: [[f64; TERMS]; TERMS]) -> [[f64; TERMS]; TERMS] {
     for column in 0..TERMS {
         for row in column..TERMS {
             let done: f64 = (0..column).map(|k| squares[row][k] * squares[column][k]).sum();
@@ -90,17 +95,20 @@ fn solve(moments: &[&Moment]) -> [[f64; 2]; TERMS] {
                 if row == column { rest.sqrt() } else { rest / squares[column][column] };
         }
     }
-    for axis in 0..2 {
-        for row in 0..TERMS {
-            let done: f64 = (0..row).map(|k| squares[row][k] * products[k][axis]).sum();
-            products[row][axis] = (products[row][axis] - done) / squares[row][row];
-        }
-        for row in (0..TERMS).rev() {
-            let done: f64 = (row + 1..TERMS).map(|k| squares[k][row] * products[k][axis]).sum();
-            products[row][axis] = (products[row][axis] - done) / squares[row][row];
-        }
+    squares
+}
+
+/// The solution of L L' x = `values`.
+fn substitute(lower: &[[f64; TERMS]; TERMS], mut values: [f64; TERMS]) -> [f64; TERMS] {
+    for row in 0..TERMS {
+        let done: f64 = (0..row).map(|k| lower[row][k] * values[k]).sum();
+        values[row] = (values[row] - done) / lower[row][row];
     }
-    products
+    for row in (0..TERMS).rev() {
+        let done: f64 = (row + 1..TERMS).map(|k| lower[k][row] * values[k]).sum();
+        values[row] = (values[row] - done) / lower[row][row];
+    }
+    values
 }
 
 #[cfg(test)]

@@ -105,3 +105,61 @@ fn flags(statistics: Statistics) -> [f32; STATISTICS] {
     ];
     flags.map(|flag| f32::from(u8::from(flag)))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::policy::PARTS;
+    use crate::record::hidden_to_bytes;
+    use crate::verifier::{Bounds, Stage};
+
+    /// Whoever says 7 is grasping something at 70, whoever says 9 is placing it at 90.
+    fn words(tokens: &[u32]) -> Option<Words> {
+        let stage = if tokens[0] == 7 { Stage::Grasp } else { Stage::Place };
+        let bounds = |side: f32| -> Bounds { [side, side, side + 1.0, side + 1.0] };
+        Some(Words { stage: Some(stage), bounds: [bounds(70.0), bounds(10.0 * tokens[0] as f32)] })
+    }
+
+    #[test]
+    fn what_candidates_say_is_read_with_where_the_gripper_is() {
+        let reader = Reader {
+            policy: "cafe",
+            action_scale: &[1.0; 7],
+            confidence: &|_, _| [0.0; PARTS],
+            words: &words,
+        };
+        let candidate = |said: u32, x: f32| CandidateRecord {
+            tokens: vec![said; 7],
+            action: (said > 0).then_some([x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
+            malformed: None,
+            score: None,
+            log_probability: -1.0,
+            log_probabilities: vec![-0.5; 7],
+            hidden: Some(hidden_to_bytes(&[0.5])),
+        };
+        let step = |candidates: Vec<CandidateRecord>| StepRecord {
+            state: [0.3, -0.1, 9.0, 9.0, 9.0, 9.0, 0.0, 1.0],
+            candidates,
+            chosen: Some(0),
+            statistics: Statistics::default(),
+            decision_ms: 1.0,
+            step_ms: 1.0,
+        };
+        let mut memory = Memory::default();
+        let grasped = Statistics { is_grasped: true, ..Statistics::default() };
+        let mut read = |candidates, before| {
+            let sample = read(&step(candidates), before, &mut memory, reader);
+            sample.expect("a whole step").expect("hidden states")
+        };
+        let first = read(vec![candidate(7, 0.1), candidate(7, 0.2)], Statistics::default());
+        assert_eq!((first.gripper, first.is_grasped()), ([0.3, -0.1], false));
+        assert_eq!(first.actions.iter().map(|action| action[0]).collect::<Vec<_>>(), [0.1, 0.2]);
+        assert_eq!(first.outlook.stage, Some(Stage::Grasp));
+        // The malformed one says nothing, and the second object is where both steps put it.
+        let second = read(vec![candidate(9, 0.1), candidate(0, 0.0)], grasped);
+        assert!(second.is_grasped() && second.actions.len() == 1);
+        assert_eq!(second.outlook.stage, Some(Stage::Place));
+        assert_eq!(second.outlook.bounds[0].map(|bounds| bounds[0]), Some(70.0));
+        assert_eq!(second.outlook.bounds[1].map(|bounds| bounds[0]), Some(80.0));
+    }
+}

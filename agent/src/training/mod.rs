@@ -11,6 +11,7 @@ mod aim;
 mod choice;
 mod decision;
 mod learner;
+mod objection;
 pub mod records;
 mod set;
 

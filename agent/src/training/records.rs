@@ -1,19 +1,18 @@
 //! Which records may teach the verifier, and what they become.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
-use protocol::{EpisodeOutcome, Statistics};
+use protocol::Statistics;
 
+use super::objection::object;
 use super::{LabelledEpisode, decision};
 use crate::labels::{LabelStore, outcome};
 use crate::policy::Confidence;
 use crate::record::{EpisodeRecord, hidden_from_bytes};
 use crate::run::{record_path, recorded};
 use crate::strategy::Strategy;
-use crate::suite::SeedRange;
 use crate::verifier::{Memory, Words};
 
 /// What records are read for.
@@ -27,94 +26,6 @@ pub struct Reader<'a> {
     pub confidence: &'a dyn Fn(&[u32], &[f32]) -> Confidence,
     /// Where a candidate sees what, from its tokens.
     pub words: &'a dyn Fn(&[u32]) -> Option<Words>,
-}
-
-/// Why an episode must not teach the verifier of a policy.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Objection {
-    /// Its placement is one of those kept for evaluation.
-    Configuration(u32),
-    /// Its scene is not one of those for collection.
-    Seed(u64),
-    /// Its candidates were not sampled.
-    Temperature(f32),
-    /// Its actions were not chosen from what the policy alone knows; or nobody knows how.
-    Strategy(String),
-    /// Its hidden states mean something else to this policy.
-    Policy(String),
-    /// It never acted, so it has no outcome.
-    NoSteps,
-}
-
-impl Objection {
-    /// The reason in few words, the same for all episodes that it holds for.
-    pub fn reason(&self) -> &'static str {
-        match self {
-            Objection::Configuration(_) => "placement of the evaluation",
-            Objection::Seed(_) => "seed outside of the collection range",
-            Objection::Temperature(_) => "greedy",
-            Objection::Strategy(_) => "chosen by the expert",
-            Objection::Policy(_) => "another policy",
-            Objection::NoSteps => "no outcome",
-        }
-    }
-}
-
-impl fmt::Display for Objection {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let first = SeedRange::Collection.first();
-        match self {
-            Objection::Configuration(configuration) => {
-                write!(formatter, "expected a random placement, got configuration {configuration}")
-            }
-            Objection::Seed(seed) => {
-                write!(
-                    formatter,
-                    "expected a seed of the collection range from {first} on, got {seed}"
-                )
-            }
-            Objection::Temperature(temperature) => {
-                write!(formatter, "expected a temperature above 0, got {temperature}")
-            }
-            Objection::Strategy(strategy) => {
-                write!(
-                    formatter,
-                    "expected a strategy that does without the expert, got {strategy}"
-                )
-            }
-            Objection::Policy(policy) => {
-                write!(
-                    formatter,
-                    "expected hidden states of the policy to train for, got policy {policy}"
-                )
-            }
-            Objection::NoSteps => {
-                write!(formatter, "expected an outcome, got an episode without steps")
-            }
-        }
-    }
-}
-
-impl std::error::Error for Objection {}
-
-/// Whether an episode may teach the verifier of the policy with this digest.
-pub fn object(outcome: &EpisodeOutcome, policy: &str) -> Option<Objection> {
-    let with_expert = |strategy: &str| strategy.parse().map_or(true, Strategy::needs_expert);
-    if let Some(configuration) = outcome.configuration {
-        Some(Objection::Configuration(configuration))
-    } else if !SeedRange::Collection.contains(outcome.seed) {
-        Some(Objection::Seed(outcome.seed))
-    } else if outcome.temperature <= 0.0 {
-        Some(Objection::Temperature(outcome.temperature))
-    } else if with_expert(&outcome.strategy) {
-        Some(Objection::Strategy(outcome.strategy.clone()))
-    } else if outcome.policy != policy {
-        Some(Objection::Policy(outcome.policy.clone()))
-    } else if outcome.steps == 0 {
-        Some(Objection::NoSteps)
-    } else {
-        None
-    }
 }
 
 /// All episodes of the given runs; refuses, naming the record, when one of them must not teach.
@@ -215,6 +126,7 @@ mod tests {
     use crate::record::{
         CandidateRecord, EpisodeIdentity, RECORD_VERSION, StepRecord, Versions, hidden_to_bytes,
     };
+    use crate::suite::SeedRange;
     use crate::training::STATISTICS;
     use protocol::Statistics;
 
