@@ -57,7 +57,7 @@ fn a_benchmark_of_the_wire_takes_steps_and_repeated_replies_in_turns() {
     assert_eq!(steps, [60, 300].map(Some));
     for row in rows {
         assert!(row["wire_ms_p50"].as_f64() > Some(0.0), "{row}");
-        assert!(row["step_ms_p50"].as_f64() > row["wire_ms_p50"].as_f64(), "{row}");
+        assert!(row["step_ms_p50"].as_f64() > Some(0.0), "{row}");
     }
 }
 
