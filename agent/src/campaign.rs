@@ -159,16 +159,9 @@ impl Campaign {
 
     /// Starts everything, rolls out, ends everything. True when somebody stopped it.
     fn roll_out(&self, runtime: &tokio::runtime::Runtime, stage: Stage<'_>) -> Result<bool> {
-        let python =
-            if self.site.servers > 0 { Some(self.site.python_environment()?) } else { None };
-        let network = runtime.block_on(Network::open(self.site.network_options()))?;
-        let local =
-            python.map(|python| self.site.start(&python, &network, self.sessions)).transpose()?;
-        let result = runtime.block_on(self.roll_out_on(&network, local.as_ref(), stage));
-        // Servers first: they would report the network's end as an error.
-        drop(local);
-        runtime.block_on(network.close())?;
-        result
+        self.site.run(runtime, self.sessions, async |network, local| {
+            self.roll_out_on(network, local, stage).await
+        })
     }
 
     async fn roll_out_on(

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, Result};
+use tokio::runtime::Runtime;
 
 use crate::servers::{LocalServerOptions, LocalServers};
 use crate::setup::{self, PythonEnvironment};
@@ -24,6 +25,23 @@ pub struct Site {
 }
 
 impl Site {
+    /// Opens the network, starts the local servers if there are any, works, and ends both. Blocks.
+    pub fn run<T>(
+        &self,
+        runtime: &Runtime,
+        sessions: usize,
+        work: impl AsyncFnOnce(&Network, Option<&LocalServers>) -> Result<T>,
+    ) -> Result<T> {
+        let python = if self.servers > 0 { Some(self.python_environment()?) } else { None };
+        let network = runtime.block_on(Network::open(self.network_options()))?;
+        let local = python.map(|python| self.start(&python, &network, sessions)).transpose()?;
+        let result = runtime.block_on(work(&network, local.as_ref()));
+        // Servers first: they would report the network's end as an error.
+        drop(local);
+        runtime.block_on(network.close())?;
+        result
+    }
+
     /// The Python that local servers run on.
     pub fn python_environment(&self) -> Result<PythonEnvironment> {
         let repository = setup::repository()?;

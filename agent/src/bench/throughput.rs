@@ -68,18 +68,21 @@ impl ThroughputBench<'_> {
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
         let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let python = self.site.python_environment()?;
-        let network = runtime.block_on(Network::open(self.site.network_options()))?;
-        let local = self.site.start(&python, &network, most)?;
-        let count = |sessions| runtime.block_on(self.count(&network, &local, sessions));
-        let rows = self.sessions.iter().copied().map(count).collect();
-        // Servers first: they would report the network's end as an error.
-        drop(local);
-        runtime.block_on(network.close())?;
-        rows
+        self.site.run(&runtime, most, async |network, local| {
+            let mut rows = Vec::new();
+            for &sessions in self.sessions {
+                rows.push(self.count(network, local, sessions).await?);
+            }
+            Ok(rows)
+        })
     }
 
-    async fn count(&self, network: &Network, local: &LocalServers, sessions: usize) -> Result<Row> {
+    async fn count(
+        &self,
+        network: &Network,
+        local: Option<&LocalServers>,
+        sessions: usize,
+    ) -> Result<Row> {
         let folder = tempfile::tempdir().context("cannot make a folder")?;
         let servers = network.servers(self.site.servers, SERVERS_WAIT).await.len();
         let title = format!("{sessions} sessions");
@@ -95,7 +98,7 @@ impl ThroughputBench<'_> {
             policy: self.policy,
             verifier: Some(Arc::clone(&self.verifier)),
             updates: None,
-            crew: Crew::new(network, Some(local), self.policy.image_size(), &name, None, servers),
+            crew: Crew::new(network, local, self.policy.image_size(), &name, None, servers),
             sessions,
             keep: Keep { all_hidden: false, video: false },
             stop,

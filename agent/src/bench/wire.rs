@@ -59,15 +59,12 @@ impl WireBench<'_> {
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
         let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let python = self.site.python_environment()?;
-        let network = runtime.block_on(Network::open(self.site.network_options()))?;
-        let local = self.site.start(&python, &network, most)?;
-        let rows = runtime.block_on(async {
+        self.site.run(&runtime, most, async |network, _| {
             let found = network.servers(1, SERVER_WAIT).await;
             let server = &found.first().context("the local server was not to be seen")?.server;
             let mut environments = Vec::new();
             for index in 0..most {
-                environments.push(self.open(&network, server, index).await?);
+                environments.push(self.open(network, server, index).await?);
             }
             let mut rows = Vec::new();
             for &sessions in self.sessions {
@@ -77,12 +74,8 @@ impl WireBench<'_> {
                 environments = used;
                 environments.extend(rest);
             }
-            anyhow::Ok(rows)
-        });
-        // The server first: it would report the network's end as an error.
-        drop(local);
-        runtime.block_on(network.close())?;
-        rows
+            Ok(rows)
+        })
     }
 
     async fn open(&self, network: &Network, server: &str, index: usize) -> Result<Environment> {
