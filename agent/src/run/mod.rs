@@ -39,8 +39,19 @@ pub struct Run {
     /// What it is.
     pub header: RunHeader,
     index: Connection,
-    /// Released by the system when the process ends, however it ends.
-    _lock: File,
+    _lock: Lock,
+}
+
+/// Released by the system when the process ends, however it ends.
+#[derive(Debug)]
+struct Lock(File);
+
+impl Drop for Lock {
+    /// A child that is being started holds a copy of every file until it runs its own program: closing ours would
+    /// leave the run locked for that long, unlocking releases it at once.
+    fn drop(&mut self) {
+        let _ = self.0.unlock();
+    }
 }
 
 /// What tables and labels need of a record.
@@ -188,12 +199,12 @@ impl From<&EpisodeRecord> for EpisodeSummary {
     }
 }
 
-fn lock(folder: &Path) -> Result<File> {
+fn lock(folder: &Path) -> Result<Lock> {
     let path = folder.join("lock");
     let file = OpenOptions::new().create(true).truncate(false).write(true).open(&path);
     let file = file.with_context(|| format!("cannot open {}", path.display()))?;
     match file.try_lock() {
-        Ok(()) => Ok(file),
+        Ok(()) => Ok(Lock(file)),
         Err(TryLockError::WouldBlock) => {
             bail!("the run {} is being written by another process", folder.display())
         }
@@ -257,6 +268,15 @@ mod tests {
         let _first = open(folder.path()).expect("a run");
         let error = open(folder.path()).expect_err("locked");
         assert!(error.to_string().ends_with("is being written by another process"), "{error}");
+    }
+
+    #[test]
+    fn a_closed_run_is_free_while_a_starting_child_still_holds_its_files() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let run = open(folder.path()).expect("a run");
+        let _held_by_the_child = run._lock.0.try_clone().expect("a copy");
+        drop(run);
+        open(folder.path()).expect("the same run");
     }
 
     #[test]
