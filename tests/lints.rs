@@ -1,9 +1,11 @@
 //! Formats, lints and types of both languages; a warning fails.
 
+use agent::simulator::libmujoco;
+
 use crate::harness::{cargo, python, repository, succeed};
 
 /// The folders with Python in them.
-const PYTHON_FOLDERS: [&str; 2] = ["env-server", "agent/training"];
+const PYTHON_FOLDERS: [&str; 3] = ["env-server", "agent/training", "tests"];
 
 #[test]
 fn rust_is_formatted() {
@@ -13,7 +15,11 @@ fn rust_is_formatted() {
 #[test]
 fn rust_has_no_warnings() {
     let mut clippy = cargo();
-    clippy.args(["clippy", "--quiet", "--workspace", "--all-targets"]);
+    let libraries = libmujoco(repository(), python()).expect("the package mujoco has a library");
+    clippy
+        .env("MUJOCO_DYNAMIC_LINK_DIR", libraries)
+        .args(["clippy", "--quiet", "--workspace", "--all-targets"])
+        .args(["--features", "simulator/mujoco"]);
     if !cfg!(debug_assertions) {
         clippy.arg("--release");
     }

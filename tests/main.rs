@@ -20,6 +20,9 @@ mod python;
 // The real client against real servers, on good wires and bad ones.
 mod wire;
 
+// The native simulator beside the Python one, and the test of servers.
+mod simulators;
+
 // Evaluations with the models that come with the program: results, kills, faults, the report.
 mod whole_loop;
 

@@ -39,6 +39,7 @@ pub mod verifier;
 // All of it together.
 pub mod campaign;
 pub mod collector;
+pub mod simulator;
 pub mod site;
 pub mod stop;
 
@@ -48,8 +49,9 @@ pub mod servers;
 pub mod setup;
 pub mod video;
 
-// What it costs.
+// What it costs, and whether a server keeps to the protocol.
 pub mod bench;
+pub mod conformance;
 
 // The program's subcommands.
 pub mod command;

@@ -7,19 +7,24 @@ use tokio::runtime::Runtime;
 
 use crate::servers::{LocalServerOptions, LocalServers};
 use crate::setup::{self, PythonEnvironment};
+use crate::simulator::{ServerProgram, Simulator};
 use crate::wire::{Network, NetworkOptions};
 
 /// Where environment servers are.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Site {
     /// Processes to start here; 0 when `connect` names others.
     pub servers: usize,
+    /// What they are.
+    pub simulator: Simulator,
     /// Endpoints of a router or of servers that run already.
     pub connect: Vec<String>,
     /// Endpoints that others may connect to, such as a trainer; a free loopback port when servers are started here.
     pub listen: Vec<String>,
     /// Who meets whom.
     pub fleet: String,
+    /// Sessions without requests end after that, on servers started here; none takes the servers' own limit.
+    pub idle_secs: Option<u32>,
     /// A Python that has the packages already, instead of the one that is set up.
     pub python: Option<PathBuf>,
 }
@@ -32,14 +37,19 @@ impl Site {
         sessions: usize,
         work: impl AsyncFnOnce(&Network, Option<&LocalServers>) -> Result<T>,
     ) -> Result<T> {
-        let python = if self.servers > 0 { Some(self.python_environment()?) } else { None };
+        let program = if self.servers > 0 { Some(self.program()?) } else { None };
         let network = runtime.block_on(Network::open(self.network_options()))?;
-        let local = python.map(|python| self.start(&python, &network, sessions)).transpose()?;
+        let local = program.map(|program| self.start(program, &network, sessions)).transpose()?;
         let result = runtime.block_on(work(&network, local.as_ref()));
         // Servers first: they would report the network's end as an error.
         drop(local);
         runtime.block_on(network.close())?;
         result
+    }
+
+    /// What local servers are started with; the first time takes minutes.
+    pub fn program(&self) -> Result<ServerProgram> {
+        ServerProgram::prepare(self.simulator, self.python_environment()?)
     }
 
     /// The Python that local servers run on.
@@ -70,7 +80,7 @@ impl Site {
     /// Starts the local servers and waits until they are ready. Blocks.
     pub fn start(
         &self,
-        python: &PythonEnvironment,
+        program: ServerProgram,
         network: &Network,
         sessions: usize,
     ) -> Result<LocalServers> {
@@ -80,7 +90,8 @@ impl Site {
             fleet: self.fleet.clone(),
             // Each could serve all of them, should the others die.
             sessions_each: sessions,
+            idle_secs: self.idle_secs,
         };
-        LocalServers::start(python, &options)
+        LocalServers::start(program, &options)
     }
 }

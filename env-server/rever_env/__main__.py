@@ -1,4 +1,4 @@
-"""Command line: expert (success table), demonstrate (training episodes), serve, health, bench."""
+"""Command line: expert (success table), demonstrate (training episodes), serve, trace and more."""
 
 import argparse
 import os
@@ -51,6 +51,16 @@ def _parser() -> argparse.ArgumentParser:
     check = commands.add_parser("health", help="ask servers whether they still work")
     health.add_arguments(check)
 
+    trace = commands.add_parser("trace", help="print every number of an episode")
+    trace.add_argument("--task", required=True)
+    trace.add_argument("--configuration", type=int, help="default: drawn from the seed")
+    trace.add_argument("--seed", type=int, default=0)
+    trace.add_argument("--side", type=int, default=128, help="of the image (default: 128)")
+    trace.add_argument(
+        "--actions", type=Path, metavar="FILE", help="7 numbers per line (default: the expert's)"
+    )
+    trace.set_defaults(run=_trace)
+
     times = commands.add_parser("bench", help="time a control step with its image")
     _add_tasks(times)
     times.add_argument("--steps", type=int, default=200, help="per task and kind (default: 200)")
@@ -94,6 +104,17 @@ def _bench(arguments: argparse.Namespace) -> int:
         with_robosuite=arguments.robosuite,
         file=arguments.json,
     )
+
+
+def _trace(arguments: argparse.Namespace) -> int:
+    from rever_env import tasks, trace
+
+    (task,) = tasks.choose(tasks.load(), [arguments.task])
+    for line in trace.lines(
+        task, arguments.configuration, arguments.seed, arguments.actions, arguments.side
+    ):
+        print(line)
+    return 0
 
 
 def _expert(arguments: argparse.Namespace) -> int:

@@ -15,12 +15,22 @@ _GEOMS_MAX = 200
 
 
 class Camera:
-    """Renders one fixed camera; the model, not the image's shape, sets its field of view."""
+    """Renders one fixed camera; the model, not the image's shape, sets its field of view.
+
+    With 0 x 0 pixels it renders nothing, and needs no OpenGL.
+    """
 
     def __init__(self, model: mujoco.MjModel, name: str, height: int, width: int) -> None:
         self._model = model
         self._height = height
         self._width = width
+        self._view = mujoco.MjvCamera()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.fixedcamid = model.camera(name).id
+        if (height, width) != (0, 0):
+            self._open(model, height, width)
+
+    def _open(self, model: mujoco.MjModel, height: int, width: int) -> None:
         try:
             self._context: Any = mujoco.GLContext(width, height)
             self._context.make_current()
@@ -38,13 +48,12 @@ class Camera:
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = 0
         self._option = mujoco.MjvOption()
-        self._view = mujoco.MjvCamera()
-        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._view.fixedcamid = model.camera(name).id
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
 
     def image(self, data: mujoco.MjData) -> Image:
         """RGB, uint8 (height, width, 3)."""
+        if self._height == 0:
+            return np.empty((0, 0, 3), np.uint8)
         self._update(data)
         return self._read()
 
@@ -78,7 +87,8 @@ class Camera:
         return x, y
 
     def close(self) -> None:
-        self._release()
+        if self._height > 0:
+            self._release()
 
     def __enter__(self) -> "Camera":
         return self

@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rever_env.success import norm
 from rever_env.tasks import Task
 
 if TYPE_CHECKING:
@@ -46,7 +48,7 @@ class Sight:
     target_origin: Vector
     held: bool
     on_target: bool
-    base_from_world: NDArray[np.float64]  # (3, 3)
+    world_from_base: NDArray[np.float64]  # (3, 3)
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def look(world: World) -> Sight:
         target_origin=data.xpos[target].copy(),
         held=world.judge.grasped(data, touch),
         on_target=world.judge.on_target(data, memory, touch),
-        base_from_world=data.xmat[base].reshape(3, 3).T.copy(),
+        world_from_base=data.xmat[base].reshape(3, 3).copy(),
     )
 
 
@@ -111,7 +113,7 @@ def _fetch(task: Task, sight: Sight) -> Decision:
     """Goes over the source, down a funnel, and closes."""
     turned = _turned(task.grasp_offset, sight.source_angle)
     goal = sight.source + turned
-    away = float(np.hypot(*(goal - sight.tcp)[:2]))
+    away = norm((goal - sight.tcp)[:2])
     turn = turn_error(task, sight)
     above = float(sight.tcp[2] - goal[2])
     is_open = sight.finger_opening >= OPEN_MIN
@@ -142,7 +144,7 @@ def _carry(task: Task, sight: Sight) -> Decision:
     rest = sight.target_origin[2] + task.target_top + task.source_bottom
     place = rest + task.release_gap
     away = sight.target_centre[:2] - sight.source_centre[:2]
-    error = float(np.hypot(*away))
+    error = norm(away)
     above = float(sight.source[2] - place)
     if error <= PLACE_TOLERANCE + 0.003 and above <= HEIGHT_TOLERANCE:
         return _decision(sight, np.zeros(3), 0.0, 1.0, "release", fine=True)
@@ -170,12 +172,12 @@ def _decision(
 ) -> Decision:
     """Scales the remaining way to one action in the base frame. Roll and pitch stay zero."""
     step = GAIN * move
-    length = float(np.sqrt(step @ step))
+    length = norm(step)
     if length > MOVE_MAX:
         step = step * (MOVE_MAX / length)
     yaw = min(max(GAIN * turn, -TURN_MAX), TURN_MAX)
     action = np.zeros(7)
-    action[:3] = sight.base_from_world @ step
+    mujoco.mju_mulMatTVec(action[:3], sight.world_from_base, step)
     action[5] = yaw  # the base's z axis is the world's
     action[6] = gripper
     return Decision(action, subtask, fine)

@@ -38,7 +38,7 @@ class Session:
             request = protocol.REQUEST.decode(data)
         except protocol.CodecError as error:
             invalid = getattr(error, "message", None)
-            if invalid is None or invalid.sequence < 1:
+            if invalid is None or not 1 <= invalid.sequence < protocol.limits.SEED_END:
                 return refused(0, str(error))
             request, refusal = invalid, str(error)
         sequence = request.sequence

@@ -68,8 +68,8 @@ class Judge:
         memory.consecutive_grasp |= memory.grasped_steps >= rule.consecutive_steps
         # SIMPLER compares the settled origin with the current centre of mass here; the
         # offset between the two leaks into the source's displacement and is kept.
-        source_moved = _norm(data.xipos[self._source][:2] - memory.source_origin)
-        target_moved = _norm(data.xpos[self._target][:2] - memory.target_origin)
+        source_moved = norm(data.xipos[self._source][:2] - memory.source_origin)
+        target_moved = norm(data.xpos[self._target][:2] - memory.target_origin)
         on_target = self.on_target(data, memory, touch)
         memory.ever_success |= on_target
         return Statistics(
@@ -96,7 +96,7 @@ class Judge:
             if self._source not in bodies or bodies[0] == bodies[1]:
                 continue
             mujoco.mj_contactForce(self._model, data, index, wrench)
-            if _norm(wrench[:3]) * self._task.settings.timestep < self._task.grasp.impulse_min:
+            if norm(wrench[:3]) * self._task.settings.timestep < self._task.grasp.impulse_min:
                 continue
             other = bodies[1] if bodies[0] == self._source else bodies[0]
             if other in self._fingers:
@@ -114,7 +114,7 @@ class Judge:
         rule = self._task.grasp
         cosine_min = math.cos(math.radians(rule.angle_max))
         for body, force, closing in zip(self._fingers, touch.fingers, (-1.0, 1.0), strict=True):
-            magnitude = _norm(force)
+            magnitude = norm(force)
             if magnitude * self._task.settings.timestep < rule.impulse_min:
                 return False
             axis = data.xmat[body].reshape(3, 3)[:, 1]
@@ -126,7 +126,7 @@ class Judge:
     def on_target(self, data: mujoco.MjData, memory: Memory, touch: Touch) -> bool:
         offset = data.xipos[self._source] - data.xipos[self._target]
         half = memory.target_half
-        near = _norm(offset[:2]) <= _norm(half[:2]) + self._task.grasp.target_margin
+        near = norm(offset[:2]) <= norm(half[:2]) + self._task.grasp.target_margin
         gap = offset[2] - half[2] - memory.source_half[2]
         above = offset[2] > 0.0 and gap <= self._task.height_offset_max
         if self._task.completely_on_target and touch.elsewhere:
@@ -149,6 +149,9 @@ def _descends(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
     return False
 
 
-def _norm(vector: Vector) -> float:
+def norm(vector: Vector) -> float:
     """Euclidean norm summed in order, so that it is the same in every language."""
-    return math.sqrt(sum(float(value) * float(value) for value in vector))
+    total = 0.0
+    for value in vector.tolist():  # sum() compensates its rounding from Python 3.12 on
+        total += value * value
+    return math.sqrt(total)

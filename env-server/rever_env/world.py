@@ -1,5 +1,6 @@
 """The world of one task: reset, step, save, restore, render."""
 
+import math
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -256,12 +257,18 @@ class World:
         data = self.data
         base = self.model.body(self.task.settings.robot_body).id
         site = self.model.site(self.task.settings.tcp).id
+        # MuJoCo's own products: numpy's may sum in another order on another processor.
         world_from_base = data.xmat[base].reshape(3, 3)
-        position = world_from_base.T @ (data.site_xpos[site] - data.xpos[base])
-        attitude = world_from_base.T @ data.site_xmat[site].reshape(3, 3) @ _DOWN.T
-        roll = np.arctan2(attitude[2, 1], attitude[2, 2])
-        pitch = np.arctan2(-attitude[2, 0], np.hypot(attitude[2, 1], attitude[2, 2]))
-        yaw = np.arctan2(attitude[1, 0], attitude[0, 0])
+        position = np.zeros(3)
+        from_base = data.site_xpos[site] - data.xpos[base]
+        mujoco.mju_mulMatTVec(position, world_from_base, from_base)
+        in_base, attitude = np.zeros((3, 3)), np.zeros((3, 3))
+        mujoco.mju_mulMatTMat(in_base, world_from_base, data.site_xmat[site].reshape(3, 3))
+        mujoco.mju_mulMatMatT(attitude, in_base, _DOWN)
+        (xx, _, _), (yx, _, _), (zx, zy, zz) = attitude.tolist()
+        roll = math.atan2(zy, zz)
+        pitch = math.atan2(-zx, math.sqrt(zy * zy + zz * zz))
+        yaw = math.atan2(yx, xx)
         return np.array([*position, roll, pitch, yaw, 0.0, self.gripper_opening()], np.float32)
 
 

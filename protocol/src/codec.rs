@@ -1,7 +1,7 @@
 //! Messages to bytes and back, strictly: a body is read only when every byte of it is meant.
 //!
-//! Reading goes: size limit → structure of the raw bytes → types → values → shape. The last step asks that the
-//! message, written again, has the shape that came: this refuses what serde would let pass (a struct sent as an
+//! Reading goes: size limit → structure of the raw bytes → types → shape → values. The shape: the message, written
+//! again, must have the one that came; this refuses what serde would let pass (a struct sent as an
 //! array, an integer for a float, text for bytes, a missing optional field). The order of a map's entries is free.
 
 use serde::Serialize;
@@ -67,17 +67,26 @@ pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
 
 /// Reads a message out of exactly `bytes`.
 pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, CodecError> {
+    match parse(bytes)? {
+        (message, None) => Ok(message),
+        (_, Some(invalid)) => Err(invalid),
+    }
+}
+
+/// Reads a message whose values may be out of bounds, with what is wrong with them: a server must know which request
+/// it refuses.
+pub fn parse<M: Message>(bytes: &[u8]) -> Result<(M, Option<CodecError>), CodecError> {
     check_size::<M>(bytes.len())?;
     let malformed = |reason| CodecError::Malformed { message: M::NAME, reason };
     let shape_came = structure::check(bytes).map_err(malformed)?;
     M::recognise(bytes).map_err(|reason| CodecError::Invalid { message: M::NAME, reason })?;
     let message: M = rmp_serde::from_slice(bytes).map_err(|error| malformed(words(error)))?;
-    message.validate().map_err(|reason| CodecError::Invalid { message: M::NAME, reason })?;
     let meant = shape(&message).map_err(malformed)?;
     if shape_came != meant {
         return Err(malformed(format!("expected the shape {meant}, got {shape_came}")));
     }
-    Ok(message)
+    let invalid = message.validate().err();
+    Ok((message, invalid.map(|reason| CodecError::Invalid { message: M::NAME, reason })))
 }
 
 /// Refuses a message by its size alone, for those who hold bytes that they have not yet copied.

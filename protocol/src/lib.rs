@@ -12,6 +12,7 @@ pub mod keys;
 pub mod limits;
 pub mod message;
 mod structure;
+pub mod transport;
 
 pub use codec::{CodecError, Message, decode, encode};
 pub use keys::{KeyError, Keys};

@@ -5,12 +5,14 @@
 mod bandwidth;
 mod decision;
 mod observations;
+mod simulators;
 mod throughput;
 mod torch;
 mod wire;
 
 pub use decision::{Comparison, DecisionBench, Report, Row, Setting};
 pub use observations::{Observation, read as read_observations};
+pub use simulators::{Row as SimulatorsRow, SimulatorsBench};
 pub use throughput::{Row as ThroughputRow, ThroughputBench};
 pub use torch::Torch;
 pub use wire::{Row as WireRow, WireBench};

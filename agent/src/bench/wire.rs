@@ -17,13 +17,13 @@ use crate::suite::{SeedRange, TASKS, VARIANT_DEFAULT};
 use crate::wire::{Environment, EnvironmentFault, Episode, Network};
 
 /// Steps before an episode is begun anew: no task's horizon is shorter.
-const EPISODE_STEPS: usize = 50;
+pub(super) const EPISODE_STEPS: usize = 50;
 /// The first steps fill caches.
-const WARM_UP_STEPS: usize = 5;
+pub(super) const WARM_UP_STEPS: usize = 5;
 /// Nothing moves, and the gripper stays open.
-const HOLD_STILL: [f32; 7] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+pub(super) const HOLD_STILL: [f32; 7] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 /// The local server is on the network already.
-const SERVER_WAIT: Duration = Duration::from_secs(30);
+pub(super) const SERVER_WAIT: Duration = Duration::from_secs(30);
 
 /// One number of sessions on one server, all of them asking at once.
 #[derive(Debug, Clone, Serialize)]
@@ -64,7 +64,7 @@ impl WireBench<'_> {
             let server = &found.first().context("the local server was not to be seen")?.server;
             let mut environments = Vec::new();
             for index in 0..most {
-                environments.push(self.open(network, server, index).await?);
+                environments.push(open(network, server, self.side, index).await?);
             }
             let mut rows = Vec::new();
             for &sessions in self.sessions {
@@ -76,19 +76,6 @@ impl WireBench<'_> {
             }
             Ok(rows)
         })
-    }
-
-    async fn open(&self, network: &Network, server: &str, index: usize) -> Result<Environment> {
-        let open = Open {
-            protocol: PROTOCOL_VERSION,
-            task: TASKS[index % TASKS.len()].to_owned(),
-            variant: VARIANT_DEFAULT.to_owned(),
-            image_height: self.side,
-            image_width: self.side,
-            expert: false,
-            holder: "bench".to_owned(),
-        };
-        Environment::open(network, server, open).await.context("cannot open a session")
     }
 
     /// Steps and repetitions of these sessions in turns.
@@ -127,8 +114,27 @@ impl WireBench<'_> {
     }
 }
 
+/// A session of the task that comes at this place.
+pub(super) async fn open(
+    network: &Network,
+    server: &str,
+    side: u32,
+    index: usize,
+) -> Result<Environment> {
+    let open = Open {
+        protocol: PROTOCOL_VERSION,
+        task: TASKS[index % TASKS.len()].to_owned(),
+        variant: VARIANT_DEFAULT.to_owned(),
+        image_height: side,
+        image_width: side,
+        expert: false,
+        holder: "bench".to_owned(),
+    };
+    Environment::open(network, server, open).await.context("cannot open a session")
+}
+
 /// Begins an episode in every session.
-async fn reset(environments: Vec<Environment>) -> Result<Vec<Episode>> {
+pub(super) async fn reset(environments: Vec<Environment>) -> Result<Vec<Episode>> {
     let begin = |(index, environment): (usize, Environment)| {
         let reset = Reset {
             task: TASKS[index % TASKS.len()].to_owned(),
@@ -143,7 +149,7 @@ async fn reset(environments: Vec<Environment>) -> Result<Vec<Episode>> {
 }
 
 /// Asks something of all sessions at once; milliseconds over their number, and what came back, in order.
-async fn at_once<From, To, Answer>(
+pub(super) async fn at_once<From, To, Answer>(
     sessions: Vec<From>,
     ask: impl Fn(From) -> Answer,
 ) -> Result<(f64, Vec<To>)>

@@ -9,9 +9,12 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
 use super::episodes::policy_folder;
-use crate::bench::{DecisionBench, Report, ThroughputBench, Torch, WireBench, read_observations};
+use crate::bench::{
+    DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench, read_observations,
+};
 use crate::policy::Policy;
 use crate::setup;
+use crate::simulator::Simulator;
 use crate::site::Site;
 use crate::verifier::Verifier;
 
@@ -27,6 +30,7 @@ enum Part {
     Decision(DecisionArguments),
     Throughput(ThroughputArguments),
     Wire(WireArguments),
+    Simulators(SimulatorsArguments),
 }
 
 /// One decision at a time on recorded observations: prefill, decode, parse, score, choose
@@ -71,6 +75,9 @@ struct ThroughputArguments {
     /// Server processes to start
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=64))]
     servers: u16,
+    /// What these processes are
+    #[arg(long, value_enum, default_value_t)]
+    simulator: Simulator,
     /// The checkpoint's folder, with its verifier [default: the one that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
@@ -95,6 +102,30 @@ struct WireArguments {
     /// Height and width of the image
     #[arg(long, default_value_t = 224, value_parser = clap::value_parser!(u32).range(1..=1024))]
     side: u32,
+    /// What the server is
+    #[arg(long, value_enum, default_value_t)]
+    simulator: Simulator,
+    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    #[arg(long, value_name = "FILE")]
+    python: Option<PathBuf>,
+    /// Write the figures into this file, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Control steps of the Python and the native server, in turns, with an image and without
+#[derive(Debug, Args)]
+struct SimulatorsArguments {
+    /// Sessions of each server that ask at once, separated by commas
+    #[arg(long, value_delimiter = ',', default_value = "1,2,4,8",
+          value_parser = clap::value_parser!(u16).range(1..=64))]
+    sessions: Vec<u16>,
+    /// Control steps of every session
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
+    steps: u32,
+    /// Height and width of the image
+    #[arg(long, default_value_t = 224, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    side: u32,
     /// A Python that has the packages of env-server, instead of the one that rever sets up
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
@@ -109,11 +140,12 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Part::Decision(arguments) => decision(arguments),
         Part::Throughput(arguments) => throughput(arguments),
         Part::Wire(arguments) => wire(arguments),
+        Part::Simulators(arguments) => simulators(arguments),
     }
 }
 
 fn wire(arguments: WireArguments) -> Result<()> {
-    let site = site(1, arguments.python);
+    let site = site(1, arguments.simulator, arguments.python);
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
     let steps = arguments.steps as usize;
     let rows = WireBench { site: &site, sessions: &sessions, steps, side: arguments.side }.run()?;
@@ -139,17 +171,45 @@ fn wire(arguments: WireArguments) -> Result<()> {
     Ok(())
 }
 
+fn simulators(arguments: SimulatorsArguments) -> Result<()> {
+    let site = site(1, Simulator::Python, arguments.python);
+    let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
+    let steps = arguments.steps as usize;
+    let bench = SimulatorsBench { site: &site, sessions: &sessions, steps, side: arguments.side };
+    let rows = bench.run()?;
+    if let Some(path) = &arguments.json {
+        write_json(path, &rows)?;
+    }
+    println!(
+        "{:>6} {:>8} {:>7} {:>9} {:>9} {:>6}",
+        "pixels", "sessions", "steps", "python", "native", "ratio"
+    );
+    for row in rows {
+        let (python, native) = (row.python_steps_per_second, row.native_steps_per_second);
+        println!(
+            "{:>6} {:>8} {:>7} {python:>9.1} {native:>9.1} {:>6.2}",
+            row.side,
+            row.sessions,
+            row.steps,
+            native / python
+        );
+    }
+    println!(
+        "control steps per second of one server process, in turns; 0 pixels: nothing is rendered"
+    );
+    Ok(())
+}
+
 /// Servers of this benchmark alone.
-fn site(servers: usize, python: Option<PathBuf>) -> Site {
-    let (connect, listen, fleet) = (Vec::new(), Vec::new(), "bench".to_owned());
-    Site { servers, connect, listen, fleet, python }
+fn site(servers: usize, simulator: Simulator, python: Option<PathBuf>) -> Site {
+    Site { servers, simulator, python, fleet: "bench".to_owned(), ..Site::default() }
 }
 
 fn throughput(arguments: ThroughputArguments) -> Result<()> {
     let folder = policy_folder(arguments.policy.as_ref())?;
     let policy = Policy::load(&folder)?;
     let verifier = Verifier::load(&folder.join("verifier.safetensors"), policy.digest())?;
-    let site = site(usize::from(arguments.servers), arguments.python);
+    let site = site(usize::from(arguments.servers), arguments.simulator, arguments.python);
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
     let bench = ThroughputBench {
         policy: &policy,

@@ -85,10 +85,9 @@ fn campaign(arguments: &Arguments) -> Result<Campaign> {
         follow_verifier: None,
         site: Site {
             servers: SERVERS,
-            connect: Vec::new(),
-            listen: Vec::new(),
             fleet: "demo".to_owned(),
             python: arguments.python.clone(),
+            ..Site::default()
         },
         sessions: SESSIONS,
         out: arguments.out.clone(),

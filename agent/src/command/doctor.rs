@@ -11,6 +11,7 @@ use serde::Serialize;
 use super::episodes::policy_folder;
 use crate::policy::{Image, Policy, ProposalRequest};
 use crate::setup::{self, PythonEnvironment};
+use crate::simulator::{ServerProgram, Simulator};
 use crate::site::Site;
 use crate::suite::{SeedRange, TASKS, VARIANT_DEFAULT};
 use crate::verifier::Verifier;
@@ -28,6 +29,9 @@ pub struct Arguments {
     /// The verifier's file [default: the one beside the policy's weights]
     #[arg(long)]
     verifier: Option<PathBuf>,
+    /// Start a server of this simulator
+    #[arg(long, value_enum, default_value_t)]
+    simulator: Simulator,
     /// Check servers that run already instead of one started here
     #[arg(long, value_delimiter = ',')]
     connect: Vec<String>,
@@ -56,10 +60,11 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let mut findings = Vec::new();
     let site = Site {
         servers: usize::from(arguments.connect.is_empty()),
+        simulator: arguments.simulator,
         connect: arguments.connect.clone(),
-        listen: Vec::new(),
         fleet: arguments.fleet.clone(),
         python: arguments.python.clone(),
+        ..Site::default()
     };
     let mut python = None;
     if site.servers > 0 {
@@ -82,7 +87,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     }
     if python.is_some() || !arguments.connect.is_empty() {
         let size = policy.as_ref().map_or((128, 128), Policy::image_size);
-        let image = check(&mut findings, "world", || check_world(&site, python.as_ref(), size));
+        let image = check(&mut findings, "world", || check_world(&site, python, size));
         if let (Some(policy), Some((image, instruction))) = (&policy, image) {
             check(&mut findings, "decision", || check_decision(policy, &image, &instruction));
         }
@@ -156,12 +161,15 @@ fn check_verifier(path: &Path, policy: &Policy) -> Result<((), String)> {
 /// Opens the network on loopback, finds a server, resets a world and steps it once.
 fn check_world(
     site: &Site,
-    python: Option<&PythonEnvironment>,
+    python: Option<PythonEnvironment>,
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
     let network = runtime.block_on(Network::open(site.network_options()))?;
-    let local = python.map(|python| site.start(python, &network, 1)).transpose()?;
+    let start = |python| -> Result<_> {
+        site.start(ServerProgram::prepare(site.simulator, python)?, &network, 1)
+    };
+    let local = python.map(start).transpose()?;
     let result = runtime.block_on(try_world(&network, image_size));
     drop(local);
     runtime.block_on(network.close())?;

@@ -8,6 +8,7 @@ use clap::Args;
 use crate::campaign::Campaign;
 use crate::rollout::Keep;
 use crate::setup;
+use crate::simulator::Simulator;
 use crate::site::Site;
 use crate::suite::{Arm, Suite, TASKS};
 
@@ -35,6 +36,9 @@ pub struct EpisodesArguments {
     /// Server processes to start on this machine [default: 2].
     #[arg(long, conflicts_with = "connect", value_parser = clap::value_parser!(u16).range(1..=64))]
     pub servers: Option<u16>,
+    /// What these processes are.
+    #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
+    pub simulator: Simulator,
     /// Use servers that run already: endpoints of them or of a router, as tcp/HOST:PORT.
     #[arg(long, value_delimiter = ',')]
     pub connect: Vec<String>,
@@ -91,10 +95,12 @@ impl EpisodesArguments {
         let started = self.servers.unwrap_or(SERVERS_DEFAULT);
         Site {
             servers: if self.connect.is_empty() { usize::from(started) } else { 0 },
+            simulator: self.simulator,
             connect: self.connect.clone(),
             listen: self.listen.clone(),
             fleet: self.fleet.clone(),
             python: self.python.clone(),
+            idle_secs: None,
         }
     }
 }

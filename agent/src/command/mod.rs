@@ -2,6 +2,7 @@
 
 mod bench;
 mod collect;
+mod conformance;
 mod demo;
 mod doctor;
 mod episodes;
@@ -33,6 +34,7 @@ enum Command {
     Report(report::Arguments),
     Doctor(doctor::Arguments),
     Bench(bench::Arguments),
+    Conformance(conformance::Arguments),
 }
 
 impl Program {
@@ -46,6 +48,7 @@ impl Program {
             Command::Report(arguments) => report::run(arguments),
             Command::Doctor(arguments) => doctor::run(arguments),
             Command::Bench(arguments) => bench::run(arguments),
+            Command::Conformance(arguments) => conformance::run(arguments),
         }
     }
 }

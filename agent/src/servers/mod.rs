@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, anyhow, bail};
 
 use self::process::ServerProcess;
-use crate::setup::PythonEnvironment;
+use crate::simulator::ServerProgram;
 
 /// Starting Python, MuJoCo and OpenGL takes 1 to 2 s; the rest is for machines under load.
 const READY_TIMEOUT_SECS: u64 = 120;
@@ -29,6 +29,8 @@ pub struct LocalServerOptions {
     pub fleet: String,
     /// How many sessions each process serves.
     pub sessions_each: usize,
+    /// A session without requests ends after that; none takes the servers' own limit.
+    pub idle_secs: Option<u32>,
 }
 
 /// Running servers; dropping them kills the processes.
@@ -42,15 +44,12 @@ pub struct LocalServers {
 impl LocalServers {
     /// Starts the servers and waits until each says that it is ready. Blocks the calling thread for
     /// seconds.
-    pub fn start(
-        environment: &PythonEnvironment,
-        options: &LocalServerOptions,
-    ) -> Result<LocalServers> {
+    pub fn start(program: ServerProgram, options: &LocalServerOptions) -> Result<LocalServers> {
         let (events, received) = channel();
         let (ready, all_ready) = channel();
         let state = Arc::new(Mutex::new(State::default()));
         let supervisor = Supervisor {
-            environment: environment.clone(),
+            program,
             options: options.clone(),
             slots: (0..options.count).map(|_| Slot::default()).collect(),
             state: Arc::clone(&state),
@@ -136,7 +135,7 @@ struct Slot {
 
 /// What the watching thread owns.
 struct Supervisor {
-    environment: PythonEnvironment,
+    program: ServerProgram,
     options: LocalServerOptions,
     slots: Vec<Slot>,
     state: Arc<Mutex<State>>,
@@ -237,11 +236,14 @@ impl Supervisor {
 
     fn spawn(&self, slot: usize) -> Result<ServerProcess> {
         let (parent, sessions) = (std::process::id(), self.options.sessions_each);
-        let mut command: Command = self.environment.command();
+        let mut command: Command = self.program.command();
         command
-            .args(["-m", "rever_env", "serve", "--exit-with-parent", &parent.to_string()])
+            .args(["serve", "--exit-with-parent", &parent.to_string()])
             .args(["--sessions", &sessions.to_string()])
             .args(["--connect", &self.options.connect, "--fleet", &self.options.fleet]);
+        if let Some(seconds) = self.options.idle_secs {
+            command.args(["--idle-secs", &seconds.to_string()]);
+        }
         let lines = self.events.clone();
         let closed = self.events.clone();
         ServerProcess::spawn(

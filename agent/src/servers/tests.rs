@@ -4,6 +4,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 use super::*;
+use crate::setup::PythonEnvironment;
 
 const WAIT_SECS: u64 = 20;
 
@@ -12,14 +13,16 @@ fn start(folder: &Path, script: &str, count: usize) -> Result<LocalServers> {
     let python = folder.join("python");
     std::fs::write(&python, format!("#!/bin/sh\n{script}\n")).unwrap();
     std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).unwrap();
-    let environment = PythonEnvironment { python, package_root: folder.to_owned() };
+    let program =
+        ServerProgram::Python(PythonEnvironment { python, package_root: folder.to_owned() });
     let options = LocalServerOptions {
         count,
         connect: "tcp/127.0.0.1:1".to_owned(),
         fleet: "test".to_owned(),
         sessions_each: 1,
+        idle_secs: None,
     };
-    LocalServers::start(&environment, &options)
+    LocalServers::start(program, &options)
 }
 
 fn wait_until(what: &str, condition: impl Fn() -> bool) {

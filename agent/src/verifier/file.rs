@@ -129,7 +129,7 @@ pub fn digest(bytes: &[u8]) -> String {
 }
 
 fn bytes_of(values: &[f32]) -> Vec<u8> {
-    values.iter().flat_map(|value| value.to_le_bytes()).collect()
+    bytemuck::cast_slice(values).to_vec()
 }
 
 fn read(tensors: &SafeTensors<'_>, name: &str, shape: &[usize]) -> anyhow::Result<Vec<f32>> {
@@ -141,6 +141,5 @@ fn read(tensors: &SafeTensors<'_>, name: &str, shape: &[usize]) -> anyhow::Resul
         tensor.dtype(),
         tensor.shape()
     );
-    let values = tensor.data().chunks_exact(4);
-    Ok(values.map(|bytes| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])).collect())
+    Ok(tensor.data().chunks_exact(4).map(bytemuck::pod_read_unaligned).collect())
 }

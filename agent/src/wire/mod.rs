@@ -9,6 +9,7 @@ mod episode;
 mod fault;
 mod network;
 mod outcomes;
+mod probe;
 mod servers;
 mod verifier_updates;
 
@@ -17,6 +18,7 @@ pub use episode::Episode;
 pub use fault::EnvironmentFault;
 pub use network::{Network, NetworkOptions, Timing};
 pub use outcomes::{OutcomePublisher, OutcomeSubscriber};
+pub use probe::Probe;
 pub use protocol::Description as ServerDescription;
 pub use protocol::Reset;
 pub use verifier_updates::{VerifierPublisher, VerifierSubscriber};

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use protocol::{Description, Keys, limits};
+use protocol::{Description, Keys, transport};
 use zenoh::Session;
 
 use super::servers::Servers;
@@ -14,8 +14,6 @@ use super::servers::Servers;
 const ANY_LOOPBACK_PORT: &str = "tcp/127.0.0.1:0";
 /// Another process may take a port between its choice and its use.
 const PORT_ATTEMPTS_MAX: usize = 10;
-/// A slow reader holds a message up that long before the link is given up.
-const CONGESTION_MICROSECONDS: u64 = 60_000_000;
 /// A client waits this long for the router or server that it is told to connect to.
 const CLIENT_WAIT_MS: u32 = 30_000;
 
@@ -138,31 +136,9 @@ fn with_ports(endpoints: &[String]) -> anyhow::Result<Vec<String>> {
 }
 
 fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Result<zenoh::Config> {
-    let rx_bytes_max = limits::MESSAGE_BYTES_MAX + 65_536;
-    // A router forwards between its clients, not between its peers, which it takes for linked. And
-    // whoever has one way out and no way in needs no more than a client does.
-    let is_client = options.connect.len() == 1 && listening.is_empty() && !options.multicast;
-    let entries = [
-        ("mode", if is_client { "\"client\"" } else { "\"peer\"" }.to_owned()),
-        ("connect/timeout_ms", format!("{{\"client\": {CLIENT_WAIT_MS}}}")),
-        ("connect/endpoints", serde_json::to_string(&options.connect)?),
-        ("listen/endpoints", serde_json::to_string(listening)?),
-        ("scouting/multicast/enabled", options.multicast.to_string()),
-        ("scouting/gossip/enabled", options.multicast.to_string()),
-        // The caches of outcomes and verifiers order their samples by time.
-        ("timestamping/enabled", "true".to_owned()),
-        ("transport/link/rx/max_message_size", rx_bytes_max.to_string()),
-        (
-            "transport/link/tx/queue/congestion_control/block/wait_before_close",
-            CONGESTION_MICROSECONDS.to_string(),
-        ),
-    ];
+    let NetworkOptions { connect, multicast, .. } = options;
     let mut configuration = zenoh::Config::default();
-    for (key, value) in entries {
-        // Left out, this is a free port on every interface: what others find by multicast.
-        if key == "listen/endpoints" && listening.is_empty() && options.multicast {
-            continue;
-        }
+    for (key, value) in transport::settings(connect, listening, *multicast, CLIENT_WAIT_MS) {
         configuration
             .insert_json5(key, &value)
             .map_err(|error| anyhow!("zenoh does not take {key} = {value}: {error}"))?;

@@ -151,7 +151,11 @@ impl Servers {
     }
 }
 
-async fn describe(session: Session, keys: Keys, server: String) -> anyhow::Result<Description> {
+pub(super) async fn describe(
+    session: Session,
+    keys: Keys,
+    server: String,
+) -> anyhow::Result<Description> {
     let replies = session
         .get(keys.describe(&server)?)
         .timeout(DESCRIBE_TIMEOUT)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from rever_env.protocol import limits, value
+from rever_env.protocol import value
 from rever_env.protocol.value import Action, State
 
 
@@ -26,8 +26,8 @@ class Observation:
 
     def validate(self) -> None:
         image = self.image
-        value.range("image height", image.height, 1, limits.IMAGE_SIDE_MAX)
-        value.range("image width", image.width, 1, limits.IMAGE_SIDE_MAX)
+        fields = "image height", "image width"
+        value.image_sides(fields, image.height, image.width)
         expected = image.height * image.width * 3
         if len(image.pixels) != expected:
             raise ValueError(

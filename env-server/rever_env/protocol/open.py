@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from rever_env.protocol import limits, value
+from rever_env.protocol import value
 from rever_env.protocol.value import U32
 
 
@@ -22,8 +22,8 @@ class Open:
         value.protocol(self.protocol)
         value.name("task", self.task)
         value.name("variant", self.variant)
-        value.range("image_height", self.image_height, 1, limits.IMAGE_SIDE_MAX)
-        value.range("image_width", self.image_width, 1, limits.IMAGE_SIDE_MAX)
+        fields = "image_height", "image_width"
+        value.image_sides(fields, self.image_height, self.image_width)
         value.name("holder", self.holder)
 
 

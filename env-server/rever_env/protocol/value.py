@@ -55,6 +55,13 @@ def range(field: str, value: int, low: int, high: int) -> None:
         raise ValueError(f"{field}: expected {low} to {high}, got {value}")
 
 
+def image_sides(fields: tuple[str, str], height: int, width: int) -> None:
+    """Both sides are 0 when no image is wanted."""
+    if (height, width) != (0, 0):
+        range(fields[0], height, 1, limits.IMAGE_SIDE_MAX)
+        range(fields[1], width, 1, limits.IMAGE_SIDE_MAX)
+
+
 def sequence(value: int, low: int) -> None:
     """A request's number; 0 stands in a reply to a request that could not be read."""
     range("sequence", value, low, limits.SEED_END - 1)

@@ -3,9 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::{single, value};
-use crate::limits::{ACTION_LENGTH, IMAGE_SIDE_MAX, STATE_LENGTH};
+use crate::limits::{ACTION_LENGTH, STATE_LENGTH};
 
-/// A picture.
+/// A picture; 0 x 0 where none was asked for.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Image {
@@ -36,8 +36,8 @@ pub struct Observation {
 
 impl Image {
     pub(crate) fn validate(&self) -> Result<(), String> {
-        value::range("image height", self.height as u64, 1, IMAGE_SIDE_MAX as u64)?;
-        value::range("image width", self.width as u64, 1, IMAGE_SIDE_MAX as u64)?;
+        let fields = ["image height", "image width"];
+        value::image_sides(fields, self.height as u64, self.width as u64)?;
         let bytes = self.height * self.width * 3;
         if self.pixels.len() != bytes {
             return Err(format!(

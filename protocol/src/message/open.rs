@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::value;
 use crate::codec::Message;
-use crate::limits::{IMAGE_SIDE_MAX, OPEN_BYTES_MAX, OPENING_BYTES_MAX};
+use crate::limits::{OPEN_BYTES_MAX, OPENING_BYTES_MAX};
 
 /// The payload of a query on `open`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -16,7 +16,7 @@ pub struct Open {
     pub task: String,
     /// Its variant.
     pub variant: String,
-    /// Rows of every image in this session.
+    /// Rows of every image in this session; with 0 x 0, observations come without one.
     pub image_height: u32,
     /// Columns of every image in this session.
     pub image_width: u32,
@@ -54,8 +54,8 @@ impl Message for Open {
         value::protocol(self.protocol)?;
         value::name("task", &self.task)?;
         value::name("variant", &self.variant)?;
-        value::range("image_height", self.image_height.into(), 1, IMAGE_SIDE_MAX as u64)?;
-        value::range("image_width", self.image_width.into(), 1, IMAGE_SIDE_MAX as u64)?;
+        let fields = ["image_height", "image_width"];
+        value::image_sides(fields, self.image_height.into(), self.image_width.into())?;
         value::name("holder", &self.holder)
     }
 }

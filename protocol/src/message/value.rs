@@ -50,6 +50,15 @@ pub fn range(field: &str, value: u64, low: u64, high: u64) -> Result<(), String>
 }
 
 /// A request's number; 0 stands in a reply to a request that could not be read.
+/// Both sides are 0 when no image is wanted.
+pub fn image_sides(fields: [&str; 2], height: u64, width: u64) -> Result<(), String> {
+    if (height, width) == (0, 0) {
+        return Ok(());
+    }
+    range(fields[0], height, 1, limits::IMAGE_SIDE_MAX as u64)?;
+    range(fields[1], width, 1, limits::IMAGE_SIDE_MAX as u64)
+}
+
 pub fn sequence(value: u64, low: u64) -> Result<(), String> {
     range("sequence", value, low, limits::SEED_END - 1)
 }

@@ -1,0 +1,223 @@
+//! Episodes: what may come when, the same reset gives the same bytes, save and restore, the horizon.
+
+use anyhow::{Result, ensure};
+use protocol::{Open, Reply, Request, decode};
+
+use super::subject::{HOLD_STILL, MOVE, Subject, Talk, names};
+use super::{Table, Tested};
+
+/// Steps that are compared.
+const STEPS: usize = 6;
+
+pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
+    table
+        .row("reset_first", "Step, Save and Restore before the first Reset are refused", async {
+            let mut talk = subject.talk().await?;
+            talk.refused(|sequence| Request::Step { sequence, action: HOLD_STILL }).await?;
+            talk.refused(|sequence| Request::Save { sequence, slot: 0 }).await?;
+            talk.refused(|sequence| Request::Restore { sequence, slot: 0 }).await?;
+            talk.reset(0).await?;
+            talk.close().await?;
+            Ok(Tested::Kept)
+        })
+        .await;
+    table
+        .row(
+            "observation",
+            "an observation has the image that was asked for, and no expert's action",
+            async {
+                let open = Open { image_height: 24, image_width: 40, ..subject.open() };
+                let mut talk = subject.talk_with(&open).await?;
+                let seen = talk.reset(0).await?;
+                let size = (seen.image.height, seen.image.width);
+                ensure!(
+                    size == (24, 40),
+                    "expected an image of 24 x 40, got {} x {}",
+                    size.0,
+                    size.1
+                );
+                ensure!(seen.expert_action.is_none(), "expected no expert's action, got one");
+                ensure!(
+                    seen.instruction == subject.task().instruction
+                        || subject.task().instruction.is_empty(),
+                    "expected the instruction {:?}, got {:?}",
+                    subject.task().instruction,
+                    seen.instruction
+                );
+                talk.close().await?;
+                Ok(Tested::Kept)
+            },
+        )
+        .await;
+    table
+        .row(
+            "reset_task",
+            "a Reset to a task or a configuration that is not offered is refused",
+            reset_task(subject),
+        )
+        .await;
+    table
+        .row(
+            "deterministic",
+            "the same Reset and actions give the same bytes, in any session",
+            deterministic(subject),
+        )
+        .await;
+    table
+        .row("seeds", "another seed gives another placement", async {
+            let mut talk = subject.talk().await?;
+            let first = talk.reset(0).await?;
+            let second = talk.reset(1).await?;
+            talk.close().await?;
+            ensure!(first != second, "expected another observation with another seed");
+            Ok(Tested::Kept)
+        })
+        .await;
+    table
+        .row("save", "Save and Restore are bit-exact; Reset empties the slots", save(subject))
+        .await;
+    table
+        .row("concurrent", "sessions at once do not change one another", concurrent(subject))
+        .await;
+    table
+        .row(
+            "horizon",
+            "the last step is truncated, and a step beyond is refused",
+            horizon(subject),
+        )
+        .await;
+}
+
+async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
+    let mut talk = subject.episode(0).await?;
+    let variant = subject.task().variant.clone();
+    let reason = talk
+        .refused(|sequence| Request::Reset {
+            sequence,
+            task: "no_such_task".to_owned(),
+            variant,
+            configuration: None,
+            seed: 0,
+        })
+        .await?;
+    names(&reason, &["no_such_task"])?;
+    let beyond = subject.task().configurations;
+    let request = talk.resetting(Some(beyond), 0);
+    names(&talk.refused(request).await?, &["configuration", &beyond.to_string()])?;
+    // Refused: the world is unchanged, and the episode goes on.
+    talk.step(HOLD_STILL).await?;
+    talk.close().await?;
+    Ok(Tested::Kept)
+}
+
+/// Replies to a Reset and some steps, without their numbers.
+async fn trajectory(talk: &mut Talk, index: u64) -> Result<Vec<Reply>> {
+    talk.reset(index).await?;
+    let mut replies = vec![unnumbered(talk)?];
+    for _ in 0..STEPS {
+        talk.step(MOVE).await?;
+        replies.push(unnumbered(talk)?);
+    }
+    Ok(replies)
+}
+
+fn unnumbered(talk: &Talk) -> Result<Reply> {
+    Ok(match decode(&talk.reply)? {
+        Reply::Observed { observation, .. } | Reply::Restored { observation, .. } => {
+            Reply::Observed { sequence: 1, observation }
+        }
+        Reply::Stepped { transition, .. } => Reply::Stepped { sequence: 1, transition },
+        other => other,
+    })
+}
+
+fn equal(expected: &[Reply], got: &[Reply]) -> Result<()> {
+    let differs = expected.iter().zip(got).position(|(expected, got)| expected != got);
+    ensure!(
+        differs.is_none() && expected.len() == got.len(),
+        "expected the same replies, got another one at step {}",
+        differs.unwrap_or_default()
+    );
+    Ok(())
+}
+
+async fn deterministic(subject: &Subject<'_>) -> Result<Tested> {
+    let mut talk = subject.talk().await?;
+    let first = trajectory(&mut talk, 0).await?;
+    trajectory(&mut talk, 1).await?;
+    let again = trajectory(&mut talk, 0).await?;
+    talk.close().await?;
+    equal(&first, &again)?;
+    let mut other = subject.talk().await?;
+    let elsewhere = trajectory(&mut other, 0).await?;
+    other.close().await?;
+    equal(&first, &elsewhere)?;
+    Ok(Tested::Kept)
+}
+
+async fn save(subject: &Subject<'_>) -> Result<Tested> {
+    let mut talk = subject.episode(0).await?;
+    talk.step(MOVE).await?;
+    let saved = unnumbered(&talk)?;
+    talk.save(2).await?;
+    let mut first = Vec::new();
+    for _ in 0..STEPS {
+        talk.step(MOVE).await?;
+        first.push(unnumbered(&talk)?);
+    }
+    let restored = talk.restore(2).await?;
+    if let Reply::Stepped { transition, .. } = &saved {
+        ensure!(restored == transition.observation, "expected the observation that was saved");
+    }
+    let mut again = Vec::new();
+    for _ in 0..STEPS {
+        talk.step(MOVE).await?;
+        again.push(unnumbered(&talk)?);
+    }
+    equal(&first, &again)?;
+    talk.reset(0).await?;
+    talk.refused(|sequence| Request::Restore { sequence, slot: 2 }).await?;
+    talk.close().await?;
+    Ok(Tested::Kept)
+}
+
+async fn concurrent(subject: &Subject<'_>) -> Result<Tested> {
+    let now = subject.network.describe(&subject.description.server).await?;
+    if now.sessions_max - now.sessions < 2 {
+        return Ok(Tested::NotTested("it has less than two free sessions".to_owned()));
+    }
+    let mut alone = subject.talk().await?;
+    let expected = [trajectory(&mut alone, 0).await?, trajectory(&mut alone, 1).await?];
+    alone.close().await?;
+    let (mut one, mut other) = (subject.talk().await?, subject.talk().await?);
+    let (first, second) = tokio::join!(trajectory(&mut one, 0), trajectory(&mut other, 1));
+    equal(&expected[0], &first?)?;
+    equal(&expected[1], &second?)?;
+    one.close().await?;
+    other.close().await?;
+    Ok(Tested::Kept)
+}
+
+async fn horizon(subject: &Subject<'_>) -> Result<Tested> {
+    const STEPS_MAX: u32 = 1_000;
+    let steps_max = subject.task().steps_max;
+    if steps_max > STEPS_MAX {
+        return Ok(Tested::NotTested(format!("its horizon is {steps_max} steps")));
+    }
+    let mut talk = subject.episode(0).await?;
+    for step in 1..=steps_max {
+        let transition = talk.step(HOLD_STILL).await?;
+        ensure!(
+            transition.truncated == (step == steps_max) || transition.terminated,
+            "expected truncated at step {steps_max} alone, got {} at step {step}",
+            transition.truncated
+        );
+        if transition.terminated {
+            break;
+        }
+    }
+    talk.refused(|sequence| Request::Step { sequence, action: HOLD_STILL }).await?;
+    talk.reset(0).await?;
+    talk.close().await?;
+    Ok(Tested::Kept)
+}

@@ -1,0 +1,202 @@
+//! The server under test, and a conversation with one of its sessions.
+
+use std::time::Duration;
+
+use anyhow::{Context, Result, anyhow, bail, ensure};
+use protocol::{
+    Description, Observation, Open, PROTOCOL_VERSION, Reply, Request, TaskDescription, Transition,
+    decode, encode,
+};
+
+use crate::suite::SeedRange;
+use crate::wire::{Network, Probe};
+
+/// A reply takes no longer, resets included.
+const REPLY_WAIT: Duration = Duration::from_secs(30);
+/// A server that answers what it should drop does so within this time.
+pub const SILENCE: Duration = Duration::from_secs(1);
+/// Of the images that are asked for: small, so that the tests are quick.
+const SIDE: u32 = 32;
+/// Nothing moves, and the gripper stays open.
+pub const HOLD_STILL: [f32; 7] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+/// Something moves.
+pub const MOVE: [f32; 7] = [0.01, 0.005, -0.01, 0.0, 0.0, 0.05, -1.0];
+
+/// The server under test.
+pub struct Subject<'a> {
+    pub network: &'a Network,
+    pub description: Description,
+}
+
+/// A session whose requests are numbered as they should be.
+pub struct Talk {
+    pub probe: Probe,
+    task: TaskDescription,
+    /// Of the last request.
+    pub sequence: u64,
+    /// The last request as it was sent, and its reply as it came.
+    pub request: Vec<u8>,
+    pub reply: Vec<u8>,
+}
+
+impl<'a> Subject<'a> {
+    pub fn new(network: &'a Network, description: Description) -> Result<Subject<'a>> {
+        ensure!(
+            !description.tasks.is_empty(),
+            "server {} offers no tasks: there is nothing to test",
+            description.server
+        );
+        Ok(Subject { network, description })
+    }
+
+    /// The task that sessions are opened for.
+    pub fn task(&self) -> &TaskDescription {
+        &self.description.tasks[0]
+    }
+
+    pub fn open(&self) -> Open {
+        Open {
+            protocol: PROTOCOL_VERSION,
+            task: self.task().task.clone(),
+            variant: self.task().variant.clone(),
+            image_height: SIDE,
+            image_width: SIDE,
+            expert: false,
+            holder: "conformance".to_owned(),
+        }
+    }
+
+    /// A session that is held.
+    pub async fn talk(&self) -> Result<Talk> {
+        self.talk_with(&self.open()).await
+    }
+
+    pub async fn talk_with(&self, open: &Open) -> Result<Talk> {
+        let mut probe = Probe::open(self.network, &self.description.server, open).await?;
+        probe.hold().await?;
+        Ok(Talk {
+            probe,
+            task: self.task().clone(),
+            sequence: 0,
+            request: Vec::new(),
+            reply: Vec::new(),
+        })
+    }
+
+    /// A session with an episode begun.
+    pub async fn episode(&self, index: u64) -> Result<Talk> {
+        let mut talk = self.talk().await?;
+        talk.reset(index).await?;
+        Ok(talk)
+    }
+}
+
+impl Talk {
+    /// Sends the next request and returns its reply.
+    pub async fn ask(&mut self, request: impl FnOnce(u64) -> Request) -> Result<Reply> {
+        let sequence = self.sequence + 1;
+        self.request = encode(&request(sequence))?;
+        self.reply = self.answer_to(&self.request.clone()).await?;
+        self.sequence = sequence;
+        let reply: Reply = decode(&self.reply)?;
+        ensure!(
+            reply.sequence() == sequence,
+            "expected a reply number {sequence}, got {} number {}",
+            reply.kind(),
+            reply.sequence()
+        );
+        Ok(reply)
+    }
+
+    /// Sends any bytes and returns what comes back.
+    pub async fn answer_to(&mut self, bytes: &[u8]) -> Result<Vec<u8>> {
+        self.probe.send(bytes).await?;
+        let reply = self.probe.receive(REPLY_WAIT).await;
+        reply.with_context(|| {
+            format!("expected a reply within {} s, got none", REPLY_WAIT.as_secs())
+        })
+    }
+
+    /// Sends bytes that must be refused, and returns the reason.
+    pub async fn refusal_of(&mut self, bytes: &[u8], sequence: u64) -> Result<String> {
+        let bytes = self.answer_to(bytes).await?;
+        match decode(&bytes)? {
+            Reply::Refused { sequence: got, reason } if got == sequence => Ok(reason),
+            other => Err(anyhow!(
+                "expected Refused number {sequence}, got {} number {}",
+                other.kind(),
+                other.sequence()
+            )),
+        }
+    }
+
+    /// Sends the next request, which must be refused, and returns the reason.
+    pub async fn refused(&mut self, request: impl FnOnce(u64) -> Request) -> Result<String> {
+        match self.ask(request).await? {
+            Reply::Refused { reason, .. } => Ok(reason),
+            other => Err(anyhow!("expected Refused, got {}", other.kind())),
+        }
+    }
+
+    /// Begins an episode on a random placement.
+    pub async fn reset(&mut self, index: u64) -> Result<Observation> {
+        let request = self.resetting(None, SeedRange::Tuning.first() + index);
+        match self.ask(request).await? {
+            Reply::Observed { observation, .. } => Ok(observation),
+            other => bail!("expected Observed, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+
+    /// A `Reset` of the task under test.
+    pub fn resetting(
+        &self,
+        configuration: Option<u32>,
+        seed: u64,
+    ) -> impl FnOnce(u64) -> Request + use<> {
+        let (task, variant) = (self.task.task.clone(), self.task.variant.clone());
+        move |sequence| Request::Reset { sequence, task, variant, configuration, seed }
+    }
+
+    pub async fn step(&mut self, action: [f32; 7]) -> Result<Transition> {
+        match self.ask(|sequence| Request::Step { sequence, action }).await? {
+            Reply::Stepped { transition, .. } => Ok(transition),
+            other => bail!("expected Stepped, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+
+    pub async fn save(&mut self, slot: u32) -> Result<()> {
+        match self.ask(|sequence| Request::Save { sequence, slot }).await? {
+            Reply::Saved { .. } => Ok(()),
+            other => bail!("expected Saved, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+
+    pub async fn restore(&mut self, slot: u32) -> Result<Observation> {
+        match self.ask(|sequence| Request::Restore { sequence, slot }).await? {
+            Reply::Restored { observation, .. } => Ok(observation),
+            other => bail!("expected Restored, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+
+    pub async fn close(&mut self) -> Result<()> {
+        match self.ask(|sequence| Request::Close { sequence }).await? {
+            Reply::Closed { .. } => Ok(()),
+            other => bail!("expected Closed, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+}
+
+fn words(reply: &Reply) -> &str {
+    match reply {
+        Reply::Refused { reason, .. } | Reply::Faulted { reason, .. } => reason,
+        _ => "",
+    }
+}
+
+/// Fails unless a reason names what it is about.
+pub fn names(reason: &str, parts: &[&str]) -> Result<()> {
+    for part in parts {
+        ensure!(reason.contains(part), "expected a reason that names {part:?}, got {reason:?}");
+    }
+    Ok(())
+}

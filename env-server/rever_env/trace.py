@@ -1,0 +1,61 @@
+"""The trace subcommand: every number of an episode, to hold two simulators beside one another."""
+
+import hashlib
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rever_env.tasks import Task
+from rever_env.world import Observation, Statistics, World
+
+
+def lines(
+    task: Task, configuration: int | None, seed: int, actions: Path | None, side: int
+) -> Iterator[str]:
+    """One JSON object for the reset and one for each step, to the horizon or the actions' end.
+
+    Floats stand as their bits, 16 (or 8) hexadecimal digits. actions: a file of one action per
+    line, 7 numbers; without it the scripted expert acts.
+    """
+    with World(task, side, side) as world:
+        observation = world.reset(configuration=configuration, seed=seed)
+        yield _line(world, observation, None)
+        for action in read(actions) if actions else _expert(world):
+            transition = world.step(action)
+            yield _line(world, transition.observation, transition.statistics)
+            if transition.truncated:
+                break
+
+
+def read(file: Path) -> Iterator[NDArray[np.float64]]:
+    """The actions of a file, float64 (7,), rounded to 32 bits as on the wire."""
+    for line in file.read_text(encoding="utf-8").splitlines():
+        yield np.array([float(word) for word in line.split()], np.float32).astype(np.float64)
+
+
+def _expert(world: World) -> Iterator[NDArray[np.float64]]:
+    while True:
+        yield world.expert_action().astype(np.float32).astype(np.float64)
+
+
+def _line(world: World, observation: Observation, statistics: Statistics | None) -> str:
+    return json.dumps(
+        {
+            "qpos": _bits(world.data.qpos),
+            "qvel": _bits(world.data.qvel),
+            "state": _bits(observation.state),
+            "expert_action": _bits(world.expert_action().astype(np.float32)),
+            "image": hashlib.sha256(observation.image.tobytes()).hexdigest(),
+            "statistics": asdict(statistics) if statistics else None,
+        }
+    )
+
+
+def _bits(numbers: NDArray[np.float64] | NDArray[np.float32]) -> list[str]:
+    kind = ">f" if numbers.dtype == np.float32 else ">d"
+    return [struct.pack(kind, number).hex() for number in numbers.tolist()]

@@ -1,0 +1,230 @@
+//! The camera: RGB images from an offscreen OpenGL context without a window.
+
+use std::cell::OnceCell;
+use std::ffi::c_void;
+use std::rc::Rc;
+use std::sync::Arc;
+
+use khronos_egl as egl;
+use mujoco_rs::prelude::*;
+use protocol::Image;
+
+use crate::fault::Fault;
+
+type Egl = egl::DynamicInstance<egl::EGL1_5>;
+
+const GEOMS_MAX: usize = 200;
+/// Of EGL_EXT_platform_device: a display of a graphics device, without a window system.
+const PLATFORM_DEVICE: egl::Enum = 0x313F;
+const DEVICES_MAX: usize = 16;
+
+/// One fixed camera; the model, not the image's shape, sets its field of view. With 0 x 0 pixels it
+/// renders nothing, and needs no OpenGL. Use it in the thread that made it.
+pub struct Camera(Option<Renderer>);
+
+struct Renderer {
+    /// Freed first, while its context exists.
+    context: Option<MjrContext>,
+    scene: MjvScene,
+    option: MjvOption,
+    view: MjvCamera,
+    rectangle: MjrRectangle,
+    offscreen: Offscreen,
+}
+
+/// An OpenGL context that draws into MuJoCo's own buffer.
+struct Offscreen {
+    display: Rc<Display>,
+    context: egl::Context,
+}
+
+/// libEGL and the first display of a device that works; the same for all cameras of a thread.
+struct Display {
+    egl: Egl,
+    display: egl::Display,
+}
+
+impl Camera {
+    pub fn new(
+        model: &Arc<MjModel>,
+        camera: usize,
+        height: u32,
+        width: u32,
+    ) -> Result<Camera, Fault> {
+        let is_wanted = (height, width) != (0, 0);
+        let renderer = is_wanted.then(|| Renderer::new(model, camera, height, width));
+        Ok(Camera(renderer.transpose()?))
+    }
+
+    /// What the camera sees now.
+    pub fn image(&mut self, data: &mut MjData<Arc<MjModel>>) -> Result<Image, Fault> {
+        match &mut self.0 {
+            Some(renderer) => renderer.image(data),
+            None => Ok(Image { height: 0, width: 0, pixels: Vec::new() }),
+        }
+    }
+}
+
+impl Renderer {
+    fn new(
+        model: &Arc<MjModel>,
+        camera: usize,
+        height: u32,
+        width: u32,
+    ) -> Result<Renderer, Fault> {
+        let offscreen = Offscreen::new().map_err(|error| {
+            Fault::RendererUnavailable(format!(
+                "renderer for {height} x {width} images: expected an offscreen OpenGL context, got {error}"
+            ))
+        })?;
+        // SAFETY: `Offscreen::new` has made its context current in this thread.
+        let mut context = unsafe { MjrContext::new(model) };
+        context.resize_offscreen(width, height);
+        context.offscreen();
+        let mut scene = MjvScene::new(Arc::clone(model), GEOMS_MAX);
+        // SAFETY: flags are plain numbers that MuJoCo reads when it renders.
+        let flags = unsafe { &mut scene.ffi_mut().flags };
+        for flag in [MjtRndFlag::mjRND_SHADOW, MjtRndFlag::mjRND_REFLECTION] {
+            flags[flag as usize] = 0;
+        }
+        Ok(Renderer {
+            context: Some(context),
+            scene,
+            option: MjvOption::default(),
+            view: MjvCamera::new_fixed(camera),
+            rectangle: MjrRectangle {
+                left: 0,
+                bottom: 0,
+                width: width as i32,
+                height: height as i32,
+            },
+            offscreen,
+        })
+    }
+
+    fn image(&mut self, data: &mut MjData<Arc<MjModel>>) -> Result<Image, Fault> {
+        // Several worlds may live in one process: each makes its own context current first.
+        self.offscreen.make_current().map_err(Fault::RendererUnavailable)?;
+        let Some(context) = &self.context else {
+            return Err(Fault::RendererUnavailable("the renderer was freed".to_owned()));
+        };
+        self.scene.update(data, &self.option, &MjvPerturb::default(), &mut self.view);
+        self.scene.render(&self.rectangle, context);
+        let (height, width) = (self.rectangle.height as usize, self.rectangle.width as usize);
+        let mut upwards = vec![0; height * width * 3];
+        context
+            .read_pixels(Some(&mut upwards), None, &self.rectangle)
+            .map_err(|error| Fault::RendererUnavailable(error.to_string()))?;
+        // OpenGL's rows start at the bottom.
+        let pixels = upwards.chunks_exact(width * 3).rev().flatten().copied().collect();
+        Ok(Image { height, width, pixels })
+    }
+}
+
+impl Drop for Renderer {
+    fn drop(&mut self) {
+        // Without its context current, freeing would free another camera's buffers.
+        if self.offscreen.make_current().is_ok() {
+            self.context.take();
+        } else {
+            std::mem::forget(self.context.take());
+        }
+    }
+}
+
+impl Offscreen {
+    /// Makes a context, and makes it current.
+    fn new() -> Result<Offscreen, String> {
+        let shared = Display::of_this_thread()?;
+        let Display { egl, display } = &*shared;
+        let wanted = [
+            (egl::RED_SIZE, 8),
+            (egl::GREEN_SIZE, 8),
+            (egl::BLUE_SIZE, 8),
+            (egl::ALPHA_SIZE, 8),
+            (egl::DEPTH_SIZE, 24),
+            (egl::STENCIL_SIZE, 8),
+            (egl::COLOR_BUFFER_TYPE, egl::RGB_BUFFER),
+            (egl::SURFACE_TYPE, egl::PBUFFER_BIT),
+            (egl::RENDERABLE_TYPE, egl::OPENGL_BIT),
+        ];
+        let mut attributes: Vec<egl::Int> =
+            wanted.into_iter().flat_map(|(name, value)| [name, value]).collect();
+        attributes.push(egl::NONE);
+        let words = |error: egl::Error| error.to_string();
+        let config = egl.choose_first_config(*display, &attributes).map_err(words)?;
+        let config = config.ok_or("no configuration with 8-bit colours and a 24-bit depth")?;
+        egl.bind_api(egl::OPENGL_API).map_err(words)?;
+        let context = egl.create_context(*display, config, None, &[egl::NONE]).map_err(words)?;
+        let offscreen = Offscreen { display: Rc::clone(&shared), context };
+        offscreen.make_current()?;
+        Ok(offscreen)
+    }
+
+    fn make_current(&self) -> Result<(), String> {
+        let Display { egl, display } = &*self.display;
+        egl.make_current(*display, None, None, Some(self.context))
+            .map_err(|error| error.to_string())
+    }
+}
+
+impl Drop for Offscreen {
+    fn drop(&mut self) {
+        let Display { egl, display } = &*self.display;
+        // A context that cannot be freed goes with the process.
+        let _ = egl.make_current(*display, None, None, None);
+        let _ = egl.destroy_context(*display, self.context);
+    }
+}
+
+impl Display {
+    fn of_this_thread() -> Result<Rc<Display>, String> {
+        thread_local! {
+            static DISPLAY: OnceCell<Rc<Display>> = const { OnceCell::new() };
+        }
+        DISPLAY.with(|known| match known.get() {
+            Some(display) => Ok(Rc::clone(display)),
+            None => {
+                let display = Rc::new(Display::open()?);
+                Ok(Rc::clone(known.get_or_init(|| display)))
+            }
+        })
+    }
+
+    fn open() -> Result<Display, String> {
+        // SAFETY: loading libEGL runs its initialisers, which is what it is for.
+        let egl = unsafe { Egl::load_required() }
+            .map_err(|error| format!("no libEGL.so.1 with EGL 1.5: {error}"))?;
+        let devices = devices(&egl)?;
+        let mut reason = "no device".to_owned();
+        for device in devices {
+            // SAFETY: the device was listed by this library.
+            let display =
+                unsafe { egl.get_platform_display(PLATFORM_DEVICE, device, &[egl::ATTRIB_NONE]) };
+            match display.and_then(|display| egl.initialize(display).map(|_| display)) {
+                Ok(display) => return Ok(Display { egl, display }),
+                Err(error) => reason = error.to_string(),
+            }
+        }
+        Err(format!("no device display: {reason}"))
+    }
+}
+
+fn devices(egl: &Egl) -> Result<Vec<*mut c_void>, String> {
+    type QueryDevices =
+        unsafe extern "system" fn(egl::Int, *mut *mut c_void, *mut egl::Int) -> egl::Boolean;
+    let query = egl
+        .get_proc_address("eglQueryDevicesEXT")
+        .ok_or("libEGL has no eglQueryDevicesEXT: expected EGL_EXT_device_enumeration")?;
+    // SAFETY: EGL_EXT_device_enumeration gives the function of this name this type.
+    let query: QueryDevices = unsafe { std::mem::transmute(query) };
+    let mut devices = vec![std::ptr::null_mut(); DEVICES_MAX];
+    let mut count = 0;
+    // SAFETY: there is room for DEVICES_MAX devices.
+    let done = unsafe { query(DEVICES_MAX as egl::Int, devices.as_mut_ptr(), &mut count) };
+    if done != egl::TRUE {
+        return Err("eglQueryDevicesEXT failed".to_owned());
+    }
+    devices.truncate(count as usize);
+    Ok(devices)
+}

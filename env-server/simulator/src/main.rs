@@ -1,0 +1,66 @@
+//! `rever-simulator`: the world of `rever_env`, natively and behind the same protocol.
+//!
+//! ```text
+//! serving     the network, and how it ends       trace     every number of an episode, to be compared
+//!   server    leases, queue, heartbeat           session   numbered requests, slots
+//!   worlds    idle worlds                        world     one task in MuJoCo: reset, step, save, restore
+//!     model, controller, success, expert, placement, camera          tasks   assets/tasks.toml
+//! ```
+
+mod camera;
+mod controller;
+mod expert;
+mod fault;
+mod model;
+mod placement;
+mod server;
+mod serving;
+mod session;
+mod success;
+mod tasks;
+mod trace;
+mod world;
+mod worlds;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{Parser, Subcommand};
+
+/// The world of rever_env, natively.
+#[derive(Parser)]
+#[command(version)]
+struct Program {
+    /// The folder with tasks.toml and the scenes.
+    #[arg(long, value_name = "FOLDER")]
+    assets: PathBuf,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Serve(serving::Arguments),
+    Trace(trace::Arguments),
+}
+
+fn main() -> ExitCode {
+    let program = Program::parse();
+    tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).init();
+    match run(program) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(program: Program) -> Result<()> {
+    let tasks = tasks::load(&program.assets)?;
+    match program.command {
+        Command::Serve(arguments) => serving::serve(arguments, tasks),
+        Command::Trace(arguments) => trace::trace(arguments, tasks),
+    }
+}

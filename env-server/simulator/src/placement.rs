@@ -1,0 +1,98 @@
+//! Placements: the 24 configurations, and random ones that stay clear of them.
+
+use protocol::limits::SEED_END;
+
+use crate::fault::Fault;
+use crate::tasks::{Placement, Task};
+
+const DRAWS_MAX: usize = 10_000;
+
+/// Steele, Lea and Flood's generator: one 64-bit word of state, the same in every language.
+struct SplitMix64 {
+    state: u64,
+}
+
+impl SplitMix64 {
+    fn next_word(&mut self) -> u64 {
+        self.state = self.state.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let word = self.state;
+        let word = (word ^ (word >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let word = (word ^ (word >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        word ^ (word >> 31)
+    }
+
+    /// low + (high - low) u with u in [0, 1) on a grid of 2^-53.
+    fn uniform(&mut self, [low, high]: [f64; 2]) -> f64 {
+        low + (high - low) * ((self.next_word() >> 11) as f64 / (1u64 << 53) as f64)
+    }
+}
+
+/// The placement of one reset: a grid configuration, or a draw from the seed.
+pub fn place(task: &Task, configuration: Option<u32>, seed: u64) -> Result<Placement, Fault> {
+    if seed >= SEED_END {
+        return Err(Fault::Wrong(format!("seed {seed}: expected 0 <= seed < 2^53")));
+    }
+    let Some(configuration) = configuration else { return draw(task, seed) };
+    let configurations = &task.rule.grid.configurations;
+    configurations.get(configuration as usize).copied().ok_or_else(|| {
+        Fault::Wrong(format!(
+            "configuration {configuration}: expected 0 <= configuration < {} for task {}",
+            configurations.len(),
+            task.name
+        ))
+    })
+}
+
+fn draw(task: &Task, seed: u64) -> Result<Placement, Fault> {
+    let ranges = &task.rule.random;
+    let mut generator = SplitMix64 { state: fnv1a(&task.name) ^ seed };
+    for _ in 0..DRAWS_MAX {
+        let placement = Placement {
+            source_x: generator.uniform(ranges.source_x),
+            source_y: generator.uniform(ranges.source_y),
+            source_yaw: generator.uniform(ranges.source_yaw),
+            target_x: generator.uniform(ranges.target_x),
+            target_y: generator.uniform(ranges.target_y),
+        };
+        let apart = distance(
+            placement.source_x - placement.target_x,
+            placement.source_y - placement.target_y,
+        );
+        if apart >= ranges.separation_min && !is_near_configuration(task, &placement) {
+            return Ok(placement);
+        }
+    }
+    Err(Fault::Wrong(format!(
+        "task {}, seed {seed}: no free placement in {DRAWS_MAX} draws",
+        task.name
+    )))
+}
+
+/// Whether source, target and yaw are all within the excluded distance of one configuration.
+fn is_near_configuration(task: &Task, placement: &Placement) -> bool {
+    let ranges = &task.rule.random;
+    let radius = ranges.exclusion_radius;
+    task.rule.grid.configurations.iter().any(|grid| {
+        distance(placement.source_x - grid.source_x, placement.source_y - grid.source_y) <= radius
+            && distance(placement.target_x - grid.target_x, placement.target_y - grid.target_y)
+                <= radius
+            && turn(placement.source_yaw - grid.source_yaw) <= ranges.exclusion_yaw
+    })
+}
+
+/// 64-bit FNV-1a: mixes the task's name into the stream, so that tasks do not share draws.
+fn fnv1a(text: &str) -> u64 {
+    let mix = |digest: u64, byte| (digest ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
+    text.bytes().fold(0xCBF2_9CE4_8422_2325, mix)
+}
+
+fn distance(x: f64, y: f64) -> f64 {
+    // Square root of plain products: correctly rounded, so equal in every language (hypot is not).
+    (x * x + y * y).sqrt()
+}
+
+/// The angle between two headings, 0 to 180 degrees.
+fn turn(degrees: f64) -> f64 {
+    let wrapped = degrees.abs() % 360.0;
+    wrapped.min(360.0 - wrapped)
+}

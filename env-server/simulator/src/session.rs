@@ -1,0 +1,221 @@
+//! One leased session: its numbered requests, its world, its saved states.
+
+use std::collections::BTreeMap;
+
+use protocol::{CodecError, FaultKind, Observation, Open, Reply, Request, encode, limits};
+
+use crate::fault::Fault;
+use crate::world::{Snapshot, World};
+use crate::worlds::{Key, Worlds};
+
+/// Answers requests exactly once each. Use it in the thread that renders.
+pub struct Session {
+    /// Steps done.
+    pub steps: u64,
+    /// Whether it was closed; it answers that same `Close` still.
+    pub closed: bool,
+    opened: Open,
+    last_sequence: u64,
+    last_reply: Vec<u8>,
+    is_running: bool,
+    slots: BTreeMap<u32, Snapshot>,
+    world: Option<(Key, World)>,
+}
+
+impl Session {
+    /// A session of an offered task, with a world of its own.
+    pub fn new(opened: Open, worlds: &mut Worlds) -> Result<Session, Fault> {
+        let key = key(&opened, &opened.task, &opened.variant);
+        let world = worlds.take(&key)?;
+        Ok(Session {
+            steps: 0,
+            closed: false,
+            opened,
+            last_sequence: 0,
+            last_reply: Vec::new(),
+            is_running: false,
+            slots: BTreeMap::new(),
+            world: Some((key, world)),
+        })
+    }
+
+    /// The reply's bytes; none when the request is older than the last one.
+    pub fn answer(&mut self, bytes: &[u8], worlds: &mut Worlds) -> Option<Vec<u8>> {
+        let (request, refusal) = match protocol::codec::parse::<Request>(bytes) {
+            Ok((request, invalid)) => (request, invalid),
+            Err(error) => return Some(refused(0, &error.to_string())),
+        };
+        let sequence = request.sequence();
+        if !(1..limits::SEED_END).contains(&sequence) {
+            return Some(refused(0, &words(refusal)));
+        }
+        if sequence < self.last_sequence {
+            return None;
+        }
+        if sequence == self.last_sequence {
+            return Some(self.last_reply.clone());
+        }
+        let expected = self.last_sequence + 1;
+        if sequence != expected {
+            return Some(refused(
+                sequence,
+                &format!("sequence: expected {expected}, got {sequence}"),
+            ));
+        }
+        let reply = match refusal {
+            Some(error) => refused(sequence, &error.to_string()),
+            None => self.perform(request, worlds),
+        };
+        self.last_sequence = sequence;
+        self.last_reply.clone_from(&reply);
+        Some(reply)
+    }
+
+    /// Gives the world back.
+    pub fn end(&mut self, worlds: &mut Worlds) {
+        self.closed = true;
+        self.is_running = false;
+        self.slots.clear();
+        self.release(worlds);
+    }
+
+    fn perform(&mut self, request: Request, worlds: &mut Worlds) -> Vec<u8> {
+        let sequence = request.sequence();
+        let reply = self.reply(request, worlds).and_then(|reply| {
+            encode(&reply).map_err(|error| Fault::Internal(format!("CodecError: {error}")))
+        });
+        match reply {
+            Ok(bytes) => bytes,
+            Err(fault) => match fault.kind() {
+                None => refused(sequence, &fault.to_string()),
+                Some(kind) => self.faulted(sequence, kind, &fault.to_string()),
+            },
+        }
+    }
+
+    fn reply(&mut self, request: Request, worlds: &mut Worlds) -> Result<Reply, Fault> {
+        let name = name(&request);
+        if self.closed {
+            return Err(Fault::Wrong(format!("expected nothing after Close, got {name}")));
+        }
+        let request = match request {
+            Request::Reset { sequence, task, variant, configuration, seed } => {
+                let world = self.world_of(&task, &variant, worlds)?;
+                let observation = world.reset(configuration, seed)?;
+                self.slots.clear();
+                self.is_running = true;
+                return Ok(Reply::Observed { sequence, observation: self.seen(observation)? });
+            }
+            Request::Close { sequence } => {
+                self.end(worlds);
+                return Ok(Reply::Closed { sequence });
+            }
+            other => other,
+        };
+        let Some((_, world)) = self.world.as_mut().filter(|_| self.is_running) else {
+            return Err(Fault::Wrong(format!("expected Reset first, got {name}: no episode runs")));
+        };
+        match request {
+            Request::Step { sequence, action } => {
+                let mut transition = world.step(&action)?;
+                self.steps += 1;
+                transition.observation = self.seen(transition.observation)?;
+                Ok(Reply::Stepped { sequence, transition })
+            }
+            Request::Save { sequence, slot } => {
+                self.slots.insert(slot, world.save()?);
+                Ok(Reply::Saved { sequence })
+            }
+            Request::Restore { sequence, slot } => {
+                let Some(snapshot) = self.slots.get(&slot) else {
+                    let slots: Vec<u32> = self.slots.keys().copied().collect();
+                    return Err(Fault::Wrong(format!(
+                        "slot: expected one of {slots:?}, got {slot}"
+                    )));
+                };
+                let observation = world.restore(snapshot)?;
+                Ok(Reply::Restored { sequence, observation: self.seen(observation)? })
+            }
+            Request::Reset { .. } | Request::Close { .. } => unreachable!("answered above"),
+        }
+    }
+
+    fn world_of(
+        &mut self,
+        task: &str,
+        variant: &str,
+        worlds: &mut Worlds,
+    ) -> Result<&mut World, Fault> {
+        worlds.task(task, variant)?;
+        let key = key(&self.opened, task, variant);
+        if self.world.as_ref().is_none_or(|(current, _)| *current != key) {
+            self.release(worlds);
+            let world = worlds.take(&key)?;
+            return Ok(&mut self.world.insert((key, world)).1);
+        }
+        match &mut self.world {
+            Some((_, world)) => Ok(world),
+            None => unreachable!("a session without a world has just taken one"),
+        }
+    }
+
+    /// The world may be broken for good: the next Reset gets another one.
+    fn faulted(&mut self, sequence: u64, kind: FaultKind, reason: &str) -> Vec<u8> {
+        self.is_running = false;
+        self.slots.clear();
+        self.world = None;
+        written(&Reply::Faulted { sequence, kind, reason: short(reason) })
+    }
+
+    fn release(&mut self, worlds: &mut Worlds) {
+        if let Some((key, world)) = self.world.take() {
+            worlds.give_back(key, world);
+        }
+    }
+
+    /// An observation with the expert's action, for those who asked for it.
+    fn seen(&self, observation: Observation) -> Result<Observation, Fault> {
+        let expert_action = match &self.world {
+            Some((_, world)) if self.opened.expert => Some(world.expert_action()?),
+            _ => None,
+        };
+        Ok(Observation { expert_action, ..observation })
+    }
+}
+
+/// The bytes of a refusal.
+pub fn refused(sequence: u64, reason: &str) -> Vec<u8> {
+    written(&Reply::Refused { sequence, reason: short(reason) })
+}
+
+fn written(reply: &Reply) -> Vec<u8> {
+    encode(reply).expect("a reason within its limit can be written")
+}
+
+fn words(error: Option<CodecError>) -> String {
+    error.map(|error| error.to_string()).unwrap_or_default()
+}
+
+fn key(opened: &Open, task: &str, variant: &str) -> Key {
+    Key {
+        task: task.to_owned(),
+        variant: variant.to_owned(),
+        image_height: opened.image_height,
+        image_width: opened.image_width,
+    }
+}
+
+fn name(request: &Request) -> &'static str {
+    match request {
+        Request::Reset { .. } => "Reset",
+        Request::Step { .. } => "Step",
+        Request::Save { .. } => "Save",
+        Request::Restore { .. } => "Restore",
+        Request::Close { .. } => "Close",
+    }
+}
+
+/// Within the limit on texts, whatever was said.
+fn short(reason: &str) -> String {
+    reason[..reason.floor_char_boundary(limits::TEXT_BYTES_MAX)].to_owned()
+}

@@ -1,0 +1,44 @@
+//! How both sides configure zenoh: loopback and nothing else unless told otherwise, and the limits on messages.
+
+use crate::limits::MESSAGE_BYTES_MAX;
+
+/// A slow reader holds a message up that long before the link is given up.
+const CONGESTION_MICROSECONDS: u64 = 60_000_000;
+/// What zenoh adds to a body.
+const ENVELOPE_BYTES: usize = 65_536;
+
+/// Entries of zenoh's configuration as key and JSON value. `client_wait_ms`: how long a client waits for the router or
+/// server that it is told to connect to.
+pub fn settings(
+    connect: &[String],
+    listen: &[String],
+    multicast: bool,
+    client_wait_ms: u32,
+) -> Vec<(&'static str, String)> {
+    // A router forwards between its clients, not between its peers, which it takes for linked. And
+    // whoever has one way out and no way in needs no more than a client does.
+    let is_client = connect.len() == 1 && listen.is_empty() && !multicast;
+    let mut entries = vec![
+        ("mode", if is_client { "\"client\"" } else { "\"peer\"" }.to_owned()),
+        ("connect/timeout_ms", format!("{{\"client\": {client_wait_ms}}}")),
+        ("connect/endpoints", json(connect)),
+        ("scouting/multicast/enabled", multicast.to_string()),
+        ("scouting/gossip/enabled", multicast.to_string()),
+        // The caches of outcomes and verifiers order their samples by time.
+        ("timestamping/enabled", "true".to_owned()),
+        ("transport/link/rx/max_message_size", (MESSAGE_BYTES_MAX + ENVELOPE_BYTES).to_string()),
+        (
+            "transport/link/tx/queue/congestion_control/block/wait_before_close",
+            CONGESTION_MICROSECONDS.to_string(),
+        ),
+    ];
+    // Left out, this is a free port on every interface: what others find by multicast.
+    if !listen.is_empty() || !multicast {
+        entries.push(("listen/endpoints", json(listen)));
+    }
+    entries
+}
+
+fn json(endpoints: &[String]) -> String {
+    serde_json::to_string(endpoints).expect("texts can be written as JSON")
+}

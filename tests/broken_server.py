@@ -1,0 +1,152 @@
+"""A server with defects for the conformance suite to find: `broken_server.py DEFECT[,DEFECT...] serve ...`."""
+
+import itertools
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from rever_env import __main__, protocol, server, session, world
+
+Session: Any = session.Session
+Server: Any = server.Server
+World: Any = world.World
+
+
+def wrap(kind: Any, name: str) -> Callable[[Callable[..., Any]], None]:
+    """Puts a function in the place of a method; it gets the method first, then the arguments."""
+    original = getattr(kind, name)
+
+    def put(function: Callable[..., Any]) -> None:
+        setattr(kind, name, lambda *arguments: function(original, *arguments))
+
+    return put
+
+
+def sequence_of(data: bytes) -> int:
+    try:
+        return protocol.REQUEST.decode(data).sequence
+    except protocol.CodecError:
+        return 0
+
+
+def repeats_twice() -> None:
+    @wrap(Session, "answer")
+    def answer(original: Any, self: Any, data: bytes) -> Any:
+        if sequence_of(data) == self._last_sequence:
+            self._last_sequence -= 1
+        return original(self, data)
+
+
+def answers_older() -> None:
+    @wrap(Session, "answer")
+    def answer(original: Any, self: Any, data: bytes) -> Any:
+        reply = original(self, data)
+        return self._last_reply if reply is None else reply
+
+
+def jumps_gaps() -> None:
+    @wrap(Session, "answer")
+    def answer(original: Any, self: Any, data: bytes) -> Any:
+        self._last_sequence = max(self._last_sequence, sequence_of(data) - 1)
+        return original(self, data)
+
+
+def drifts() -> None:
+    count = itertools.count()
+
+    @wrap(Session, "_reset")
+    def reset(original: Any, self: Any, request: protocol.Reset) -> Any:
+        return original(self, replace(request, seed=request.seed + 1000 * next(count)))
+
+
+def one_seed() -> None:
+    @wrap(Session, "_reset")
+    def reset(original: Any, self: Any, request: protocol.Reset) -> Any:
+        return original(self, replace(request, seed=0))
+
+
+def forgets_command() -> None:
+    @wrap(World, "restore")
+    def restore(original: Any, self: Any, content: bytes) -> Any:
+        observation = original(self, content)
+        self.controller.reset(self.data)
+        return observation
+
+
+def never_ends() -> None:
+    @wrap(World, "step")
+    def step(original: Any, self: Any, action: Any) -> Any:
+        return replace(original(self, action), truncated=False)
+
+
+def keeps_leases() -> None:
+    Server._hold = lambda self, name, sample: None
+    Server._end_abandoned = lambda self, now: None
+
+
+def mute() -> None:
+    Server._heartbeat = lambda self: protocol.Heartbeat("another", 0, 0, 0)
+
+
+def any_version() -> None:
+    protocol.OPEN._recognise = None
+    original = protocol.Open.validate
+
+    def validate(self: protocol.Open) -> None:
+        original(replace(self, protocol=protocol.PROTOCOL_VERSION))
+
+    protocol.Open.validate = validate  # type: ignore[method-assign]
+
+
+def steps_unreset() -> None:
+    @wrap(Session, "__init__")
+    def init(original: Any, self: Any, opened: protocol.Open, worlds: Any) -> None:
+        original(self, opened, worlds)
+        self._world.reset(configuration=None, seed=0)
+        self._running = True
+
+
+def no_limit() -> None:
+    @wrap(Server, "_sessions")
+    def sessions(original: Any, self: Any) -> int:
+        return min(int(original(self)), self._options.sessions_max - 1)
+
+
+def forgets_close() -> None:
+    @wrap(Session, "end")
+    def end(original: Any, self: Any) -> None:
+        self._running = False
+        self._slots.clear()
+
+
+def other_size() -> None:
+    @wrap(Session, "__init__")
+    def init(original: Any, self: Any, opened: protocol.Open, worlds: Any) -> None:
+        original(self, replace(opened, image_height=opened.image_width), worlds)
+
+
+DEFECTS = {
+    function.__name__: function
+    for function in (
+        repeats_twice,
+        answers_older,
+        jumps_gaps,
+        drifts,
+        one_seed,
+        forgets_command,
+        never_ends,
+        keeps_leases,
+        mute,
+        any_version,
+        steps_unreset,
+        no_limit,
+        forgets_close,
+        other_size,
+    )
+}
+
+if __name__ == "__main__":
+    for defect in sys.argv.pop(1).split(","):
+        DEFECTS[defect]()
+    sys.exit(__main__.main())

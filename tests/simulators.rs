@@ -1,0 +1,160 @@
+//! The native simulator beside the Python one: the same numbers, bit for bit, and the same protocol.
+
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+use std::process::Stdio;
+use std::sync::OnceLock;
+
+use agent::simulator::{ServerProgram, Simulator};
+use agent::suite::TASKS;
+use serde_json::Value;
+
+use crate::harness::{python, repository, rever, run, succeed, text};
+use crate::server::free_endpoint;
+
+/// Rows of the suite that a server with the defects must fail, and no others.
+const BROKEN: [(&str, &[&str]); 6] = [
+    ("answers_older,never_ends,other_size", &["older", "horizon", "observation"]),
+    ("repeats_twice", &["repeated", "close"]),
+    (
+        "drifts,mute,any_version",
+        &[
+            "heartbeat",
+            "version",
+            "repeated",
+            "gap",
+            "unreadable",
+            "size",
+            "number_limit",
+            "values",
+            "slots",
+            "deterministic",
+            "concurrent",
+        ],
+    ),
+    ("jumps_gaps,forgets_command,steps_unreset", &["gap", "save", "reset_first"]),
+    ("one_seed,no_limit", &["seeds", "sessions_max"]),
+    ("keeps_leases", &["holder_gone", "holder_missing", "idle"]),
+];
+
+/// Built once.
+fn native() -> &'static ServerProgram {
+    static PROGRAM: OnceLock<ServerProgram> = OnceLock::new();
+    PROGRAM.get_or_init(|| {
+        ServerProgram::prepare(Simulator::Native, python().clone()).expect("it is built")
+    })
+}
+
+fn trace(program: &ServerProgram, arguments: &[&str]) -> Vec<Value> {
+    let said = succeed(program.command().arg("trace").args(arguments));
+    said.lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect()
+}
+
+/// Joint positions, velocities, state, the expert's action, statistics and the image of every step.
+fn assert_equal_traces(arguments: &[&str]) {
+    let in_python = ServerProgram::Python(python().clone());
+    let (expected, got) = (trace(&in_python, arguments), trace(native(), arguments));
+    assert!(expected.len() > 60, "{arguments:?}: expected a reset and an episode's steps");
+    assert_eq!(expected.len(), got.len(), "{arguments:?}");
+    for (step, (expected, got)) in expected.iter().zip(&got).enumerate() {
+        assert_eq!(expected, got, "{arguments:?}: step {step}");
+    }
+}
+
+#[test]
+fn the_experts_episodes_are_equal_bit_for_bit() {
+    for task in TASKS {
+        assert_equal_traces(&["--task", task, "--seed", "5"]);
+    }
+}
+
+#[test]
+fn wild_actions_are_equal_bit_for_bit() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("actions.txt");
+    let mut actions = String::new();
+    let mut state = 1u32;
+    let mut uniform = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        f64::from(state) / f64::from(u32::MAX) - 0.5
+    };
+    for _ in 0..120 {
+        for scale in [0.06, 0.06, 0.06, 0.3, 0.3, 0.6, 2.0] {
+            write!(actions, "{} ", scale * uniform()).expect("a text takes more");
+        }
+        actions.push('\n');
+    }
+    std::fs::write(&file, actions).expect("written");
+    let file = file.to_str().expect("a readable path");
+    for task in TASKS {
+        assert_equal_traces(&[
+            "--task",
+            task,
+            "--configuration",
+            "7",
+            "--side",
+            "224",
+            "--actions",
+            file,
+        ]);
+    }
+}
+
+/// The rows that failed, and how many passed.
+fn conformance(arguments: &[&str]) -> (BTreeSet<String>, usize, String) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("rows.json");
+    let mut command = rever();
+    command.current_dir(repository()).arg("conformance").args(arguments).arg("--json").arg(&file);
+    let output = run(&mut command);
+    let rows = std::fs::read(&file).unwrap_or_else(|error| panic!("{error}\n{}", text(&output)));
+    let rows: Vec<Value> = serde_json::from_slice(&rows).expect("rows");
+    let with = |verdict: &str| -> BTreeSet<String> {
+        let rows = rows.iter().filter(|row| row["verdict"] == verdict);
+        rows.map(|row| row["name"].as_str().expect("a name").to_owned()).collect()
+    };
+    let failed = with("fail");
+    assert_eq!(output.status.success(), failed.is_empty(), "{}", text(&output));
+    (failed, with("pass").len(), text(&output))
+}
+
+#[test]
+fn our_servers_conform() {
+    for server in ["python", "native"] {
+        let (failed, passed, said) = conformance(&["--server", server]);
+        assert!(failed.is_empty(), "{server}: {said}");
+        assert_eq!(passed, said.lines().filter(|line| line.starts_with("pass ")).count());
+        assert!(!said.contains("skip "), "{server}: {said}");
+    }
+}
+
+#[test]
+fn a_broken_server_fails_every_row_that_it_should() {
+    // They wait more than they work.
+    for some in BROKEN.chunks(BROKEN.len() / 2) {
+        std::thread::scope(|scope| {
+            for (defects, rows) in some {
+                scope.spawn(|| assert_failures(defects, rows));
+            }
+        });
+    }
+}
+
+fn assert_failures(defects: &str, rows: &[&str]) {
+    let endpoint = free_endpoint();
+    let mut server = python()
+        .command()
+        .arg(repository().join("tests/broken_server.py"))
+        .args([defects, "serve", "--sessions", "4", "--idle-secs", "12"])
+        .args(["--exit-with-parent", "--listen", &endpoint])
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the server starts");
+    let (failed, _, said) = conformance(&["--connect", &endpoint]);
+    server.kill().expect("the server runs");
+    server.wait().expect("a killed server ends");
+    let expected: BTreeSet<String> = rows.iter().copied().map(str::to_owned).collect();
+    assert_eq!(failed, expected, "{defects}: {said}");
+}
