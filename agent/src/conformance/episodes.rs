@@ -25,28 +25,7 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
         .row(
             "observation",
             "an observation has the image that was asked for, and no expert's action",
-            async {
-                let open = Open { image_height: 24, image_width: 40, ..subject.open() };
-                let mut talk = subject.talk_with(&open).await?;
-                let seen = talk.reset(0).await?;
-                let size = (seen.image.height, seen.image.width);
-                ensure!(
-                    size == (24, 40),
-                    "expected an image of 24 x 40, got {} x {}",
-                    size.0,
-                    size.1
-                );
-                ensure!(seen.expert_action.is_none(), "expected no expert's action, got one");
-                ensure!(
-                    seen.instruction == subject.task().instruction
-                        || subject.task().instruction.is_empty(),
-                    "expected the instruction {:?}, got {:?}",
-                    subject.task().instruction,
-                    seen.instruction
-                );
-                talk.close().await?;
-                Ok(Tested::Kept)
-            },
+            observation(subject),
         )
         .await;
     table
@@ -86,6 +65,23 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
             horizon(subject),
         )
         .await;
+}
+
+async fn observation(subject: &Subject<'_>) -> Result<Tested> {
+    let open = Open { image_height: 24, image_width: 40, ..subject.open() };
+    let mut talk = subject.talk_with(&open).await?;
+    let seen = talk.reset(0).await?;
+    let size = (seen.image.height, seen.image.width);
+    ensure!(size == (24, 40), "expected an image of 24 x 40, got {} x {}", size.0, size.1);
+    ensure!(seen.expert_action.is_none(), "expected no expert's action, got one");
+    ensure!(
+        seen.instruction == subject.task().instruction || subject.task().instruction.is_empty(),
+        "expected the instruction {:?}, got {:?}",
+        subject.task().instruction,
+        seen.instruction
+    );
+    talk.close().await?;
+    Ok(Tested::Kept)
 }
 
 async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
