@@ -93,24 +93,9 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         return int(self.np_random.integers(_RANDOM_SEEDS))
 
 
-def register() -> None:
-    """Registers every task's id; importing this module does it."""
-    for task in tasks.load().values():
-        if task.gymnasium_id not in gymnasium.registry:
-            gymnasium.register(
-                id=task.gymnasium_id,
-                entry_point="rever_env.gymnasium_env:BridgeEnv",
-                kwargs={"task": task.name},
-                max_episode_steps=task.steps_max,
-            )
-
-
 def _fields(observation: Observation) -> dict[str, Any]:
     return {
         "image": observation.image,
         "state": observation.state,
         "instruction": observation.instruction,
     }
-
-
-register()

@@ -1,6 +1,7 @@
-"""What the Python tests share: the software renderer, and one world per task."""
+"""What the Python tests share: the software renderer, one world per task, free ports."""
 
 import os
+import socket
 from collections.abc import Iterator
 
 import pytest
@@ -33,3 +34,10 @@ def cube_world() -> Iterator[World]:
     """One task stands for all where the task makes no difference."""
     with World(TASKS["widowx_stack_cube"]) as world:
         yield world
+
+
+def free_endpoint() -> str:
+    """An endpoint of this machine alone that nobody uses now."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import rever_env.gymnasium_env  # noqa: F401  (registers the ids)
+import rever_env  # noqa: F401  (registers the ids)
 from rever_env.protocol import Statistics
 from rever_env.tasks import Task
 from rever_env.world import World

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from conftest import free_endpoint
 
 from rever_env import protocol, tasks, world
 from rever_env.serving import Endpoints
@@ -215,13 +215,6 @@ def serve(endpoint: str, *arguments: str, launcher: tuple[str, ...] = ()) -> sub
     return subprocess.Popen(
         [*launcher, *command], stdout=subprocess.PIPE, text=True, env=environment
     )
-
-
-def free_endpoint() -> str:
-    """An endpoint of this machine alone that nobody uses now."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
 
 
 def first_line(process: subprocess.Popen[str]) -> str:
