@@ -6,5 +6,7 @@ mod examples;
 mod golden;
 /// Zenoh keys and the names that may stand in them.
 mod keys;
+/// The README says what the types say.
+mod readme;
 /// Bytes that must be refused, and the words for it.
 mod refused;
