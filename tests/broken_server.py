@@ -81,7 +81,6 @@ def never_ends() -> None:
 
 
 def keeps_leases() -> None:
-    Server._hold = lambda self, name, sample: None
     Server._end_abandoned = lambda self, now: None
 
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import zenoh
@@ -45,14 +45,25 @@ class ServerOptions:
 
 @dataclass
 class _Lease:
-    """A session with what zenoh holds for it."""
+    """A session with what zenoh holds for it.
+
+    zenoh's threads write used_at and holder at once: a simulation thread that was busy for long
+    must not take what waits in its queue for silence.
+    """
 
     session: Session
     publisher: Any
     declared: list[Any]
     opened_at: float
     used_at: float
-    held: bool = False
+    holder: Literal["awaited", "alive", "gone"] = "awaited"
+
+    def on_token(self, sample: Any) -> None:
+        """The holder's liveliness token came or went."""
+        if sample.kind == zenoh.SampleKind.PUT:
+            self.holder = "alive"
+        elif self.holder == "alive":
+            self.holder = "gone"
 
 
 class Server:
@@ -78,9 +89,11 @@ class Server:
         """Declares everything, the liveliness token last; then works until stop is set."""
         declared: list[Any] = [
             self._network.declare_queryable(
-                self._keys.describe(self.id), self._enqueuing(self._describe)
+                self._keys.describe(self.id), _direct(self._enqueuing(self._describe))
             ),
-            self._network.declare_queryable(self._keys.open(self.id), self._enqueuing(self._open)),
+            self._network.declare_queryable(
+                self._keys.open(self.id), _direct(self._enqueuing(self._open))
+            ),
         ]
         heartbeat = self._network.declare_publisher(
             self._keys.heartbeat(self.id),
@@ -113,8 +126,8 @@ class Server:
                 continue
             work()
 
-    def _enqueuing(self, act: Callable[[Any], None]) -> Any:
-        """A zenoh handler that leaves act to the simulation thread and drops what is too much."""
+    def _enqueuing(self, act: Callable[[Any], None]) -> Callable[[Any], None]:
+        """A callback that leaves act to the simulation thread and drops what is too much."""
 
         def callback(event: Any) -> None:
             if self._work.qsize() < self._work_max:
@@ -122,14 +135,13 @@ class Server:
             else:
                 _log.warning("more is asked than %d waiting requests", self._work_max)
 
-        # Called by zenoh's own thread: a thread between the two would cost a switch per request.
-        return zenoh.handlers.Callback(callback, indirect=False)
+        return callback
 
     def _describe(self, query: Any) -> None:
         description = protocol.Description(
             protocol=protocol.PROTOCOL_VERSION,
             server=self.id,
-            simulator="rever_env",
+            simulator=self._worlds.simulator,
             simulator_version=f"{metadata_version()} mujoco {mujoco.__version__}",
             tasks=tuple(
                 protocol.TaskDescription(
@@ -180,16 +192,18 @@ class Server:
         now = time.monotonic()
         lease = _Lease(session, publisher, [publisher], opened_at=now, used_at=now)
         self._leases[name] = lease
+        enqueue = self._enqueuing(lambda sample: self._answer(name, sample))
+
+        def on_request(sample: Any) -> None:
+            lease.used_at = time.monotonic()
+            enqueue(sample)
+
         lease.declared.append(
-            self._network.declare_subscriber(
-                self._keys.request(name), self._enqueuing(lambda sample: self._answer(name, sample))
-            )
+            self._network.declare_subscriber(self._keys.request(name), _direct(on_request))
         )
         lease.declared.append(
             self._network.liveliness().declare_subscriber(
-                self._keys.session(name),
-                self._enqueuing(lambda sample: self._hold(name, sample)),
-                history=True,
+                self._keys.session(name), _direct(lease.on_token), history=True
             )
         )
         _log.info("session %s opened for %s", name, opened.holder)
@@ -199,7 +213,6 @@ class Server:
         lease = self._leases.get(name)
         if lease is None:
             return
-        lease.used_at = time.monotonic()
         try:
             protocol.REQUEST.check_size(len(sample.payload))
         except protocol.TooLarge as error:
@@ -209,20 +222,13 @@ class Server:
         if reply is not None:
             lease.publisher.put(reply)
 
-    def _hold(self, name: str, sample: Any) -> None:
-        lease = self._leases.get(name)
-        if lease is None:
-            return
-        if sample.kind == zenoh.SampleKind.PUT:
-            lease.held = True
-        elif lease.held:
-            self._end(name, "its holder is gone")
-
     def _end_abandoned(self, now: float) -> None:
         for name, lease in list(self._leases.items()):
             if lease.session.closed and now - lease.used_at > _CLOSED_SECS_MAX:
                 self._end(name, None)
-            elif not lease.held and now - lease.opened_at > _HOLDER_SECS_MAX:
+            elif lease.holder == "gone":
+                self._end(name, "its holder is gone")
+            elif lease.holder == "awaited" and now - lease.opened_at > _HOLDER_SECS_MAX:
                 self._end(name, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
             elif now - lease.used_at > self._options.idle_secs_max:
                 self._end(name, f"no request came for {self._options.idle_secs_max} s")
@@ -244,6 +250,11 @@ class Server:
     def _sessions(self) -> int:
         """Sessions in use."""
         return sum(not lease.session.closed for lease in self._leases.values())
+
+
+def _direct(callback: Callable[[Any], None]) -> Any:
+    """Called by zenoh's own thread: a thread between the two would cost a switch per request."""
+    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def resident_bytes() -> int:

@@ -9,8 +9,12 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rever_env.protocol import limits
+
+if TYPE_CHECKING:
+    from rever_env.worlds import Worlds
 
 _FINISH_SECS_MAX = 10.0  # a wedged simulation is given up after that
 _PARENT_POLL_SECS = 0.5
@@ -43,6 +47,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--id-file", type=Path, help="write the server's id there when it is ready, for health"
+    )
+    parser.add_argument(
+        "--robosuite", nargs="+", metavar="TASK", help="offer robosuite's tasks instead of ours"
+    )
+    parser.add_argument(
+        "--robots", nargs="+", default=["Panda"], metavar="ROBOT", help="(default: Panda)"
+    )
+    parser.add_argument(
+        "--horizon", type=int, default=500, help="control steps of robosuite's tasks (default: 500)"
+    )
+    parser.add_argument(
+        "--control-hz", type=float, default=20.0, help="of robosuite's tasks (default: 20)"
     )
     parser.set_defaults(run=serve)
 
@@ -91,9 +107,7 @@ def serve(arguments: argparse.Namespace) -> int:
     """Serves until a signal comes or the parent is gone; prints `ready {server id}` when it can."""
     import zenoh
 
-    from rever_env import tasks
     from rever_env.server import Server, ServerOptions
-    from rever_env.worlds import Worlds
 
     if not (arguments.connect or arguments.listen or arguments.multicast):
         print("error: expected --connect, --listen or --multicast, got none", file=sys.stderr)
@@ -105,13 +119,14 @@ def serve(arguments: argparse.Namespace) -> int:
         signal.signal(number, lambda *_: stop.set())
     options = ServerOptions(arguments.fleet, arguments.sessions, arguments.idle_secs)
     failures: list[BaseException] = []
+    worlds = _worlds(arguments, options.sessions_max)
     try:
         network = zenoh.open(zenoh.Config.from_json5(endpoints.configuration()))
     except zenoh.ZError as error:
         print(f"error: cannot open the network: {error}", file=sys.stderr)
         return 1
     with network:
-        server = Server(network, Worlds(tasks.load(), options.sessions_max), options)
+        server = Server(network, worlds, options)
 
         def ready(name: str) -> None:
             if arguments.id_file:
@@ -136,6 +151,22 @@ def serve(arguments: argparse.Namespace) -> int:
             logging.error("the simulation did not end within %.0f s", _FINISH_SECS_MAX)
             os._exit(1)
     return 1 if failures else 0
+
+
+def _worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
+    from rever_env import robosuite_world, tasks
+    from rever_env.worlds import Worlds
+
+    if not arguments.robosuite:
+        return Worlds(tasks.load(), idle_max)
+    return Worlds(
+        robosuite_world.offered(
+            arguments.robosuite, arguments.robots, arguments.horizon, arguments.control_hz
+        ),
+        idle_max,
+        robosuite_world.RobosuiteWorld,
+        robosuite_world.simulator(),
+    )
 
 
 def _wait(stop: threading.Event, parent: int | None) -> None:

@@ -1,12 +1,12 @@
 """One leased session: its numbered requests, its world, its saved states."""
 
 import logging
+from typing import Any
 
 import numpy as np
 
 from rever_env import protocol, world
-from rever_env.world import World
-from rever_env.worlds import Key, UnknownTask, Worlds
+from rever_env.worlds import AnyWorld, Key, UnknownTask, Worlds
 
 _log = logging.getLogger(__name__)
 
@@ -26,10 +26,10 @@ class Session:
         self._last_sequence = 0
         self._last_reply = b""
         self._running = False
-        self._slots: dict[int, bytes] = {}
+        self._slots: dict[int, Any] = {}
         worlds.task(opened.task, opened.variant)
         self._key: Key | None = self._key_of(opened.task, opened.variant)
-        self._world: World | None = worlds.take(self._key)
+        self._world: AnyWorld | None = worlds.take(self._key)
 
     def answer(self, data: bytes) -> bytes | None:
         """The reply's bytes; None when the request is older than the last one."""

@@ -1,13 +1,61 @@
 """The worlds of one process: made when first needed, handed from session to session, limited."""
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sized
+from typing import Any, Protocol
 
-from rever_env.tasks import Task
-from rever_env.world import World
+import numpy as np
+from numpy.typing import NDArray
+
+from rever_env.world import Observation, Transition, World
 
 Key = tuple[str, str, int, int]
-Maker = Callable[[Task, int, int], World]
+Maker = Callable[[Any, int, int], "AnyWorld"]
+
+
+class OfferedTask(Protocol):
+    """What a server says of a task."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def variant(self) -> str: ...
+    @property
+    def version(self) -> int: ...
+    @property
+    def instruction(self) -> str: ...
+    @property
+    def steps_max(self) -> int: ...
+    @property
+    def configurations(self) -> Sized: ...
+
+
+class AnyWorld(Protocol):
+    """What a session needs of a world, whatever simulates it; its errors: rever_env.fault."""
+
+    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+        """The same arguments give the same bytes."""
+        ...
+
+    def step(self, action: NDArray[np.float64]) -> Transition:
+        """One control step."""
+        ...
+
+    def save(self) -> Any:
+        """The whole state, for restore of the same world."""
+        ...
+
+    def restore(self, content: Any) -> Observation:
+        """Returns to a saved state, bit-exact."""
+        ...
+
+    def expert_action(self) -> NDArray[np.float64]:
+        """What a scripted expert would do, if there is one."""
+        ...
+
+    def close(self) -> None:
+        """Frees what the world holds."""
+        ...
 
 
 class UnknownTask(ValueError):
@@ -21,13 +69,20 @@ class Worlds:
     gets. idle_max: worlds kept that no session uses; making one takes tens of milliseconds.
     """
 
-    def __init__(self, tasks: Mapping[str, Task], idle_max: int, make: Maker = World) -> None:
+    def __init__(
+        self,
+        tasks: Mapping[str, OfferedTask],
+        idle_max: int,
+        make: Maker = World,
+        simulator: str = "rever_env",
+    ) -> None:
+        self.simulator = simulator
         self.tasks = {(task.name, task.variant): task for task in tasks.values()}
         self._idle_max = idle_max
         self._make = make
-        self._idle: deque[tuple[Key, World]] = deque()
+        self._idle: deque[tuple[Key, AnyWorld]] = deque()
 
-    def task(self, name: str, variant: str) -> Task:
+    def task(self, name: str, variant: str) -> OfferedTask:
         """The task; UnknownTask when it is not offered."""
         task = self.tasks.get((name, variant))
         if task is None:
@@ -35,7 +90,7 @@ class Worlds:
             raise UnknownTask(f"expected one of the tasks {offered}, got {name} ({variant})")
         return task
 
-    def take(self, key: Key) -> World:
+    def take(self, key: Key) -> AnyWorld:
         """A world for the caller alone. key: task, variant, image height, image width."""
         for index, (idle_key, world) in enumerate(self._idle):
             if idle_key == key:
@@ -44,7 +99,7 @@ class Worlds:
         name, variant, height, width = key
         return self._make(self.task(name, variant), height, width)
 
-    def give_back(self, key: Key, world: World) -> None:
+    def give_back(self, key: Key, world: AnyWorld) -> None:
         """Keeps a sound world for the next taker; closes the one unused for longest if need be."""
         self._idle.append((key, world))
         if len(self._idle) > self._idle_max:

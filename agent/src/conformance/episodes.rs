@@ -1,6 +1,6 @@
 //! Episodes: what may come when, the same reset gives the same bytes, save and restore, the horizon.
 
-use anyhow::{Result, ensure};
+use anyhow::{Result, bail, ensure};
 use protocol::{Open, Reply, Request, decode};
 
 use super::subject::{HOLD_STILL, MOVE, Subject, Talk, names};
@@ -129,12 +129,32 @@ fn unnumbered(talk: &Talk) -> Result<Reply> {
 
 fn equal(expected: &[Reply], got: &[Reply]) -> Result<()> {
     let differs = expected.iter().zip(got).position(|(expected, got)| expected != got);
-    ensure!(
-        differs.is_none() && expected.len() == got.len(),
-        "expected the same replies, got another one at step {}",
-        differs.unwrap_or_default()
-    );
+    if let Some(step) = differs {
+        let what = difference(&expected[step], &got[step]);
+        bail!("expected the same replies, got another {what} at step {step}");
+    }
     Ok(())
+}
+
+/// What two replies to the same request do not have in common.
+fn difference(expected: &Reply, got: &Reply) -> &'static str {
+    let parts = |reply: &Reply| match reply {
+        Reply::Observed { observation, .. } => Some((observation.clone(), None)),
+        Reply::Stepped { transition, .. } => {
+            let rest = (transition.statistics, transition.reward, transition.truncated);
+            Some((transition.observation.clone(), Some(rest)))
+        }
+        _ => None,
+    };
+    match (parts(expected), parts(got)) {
+        (Some((expected, before)), Some((got, after))) => match () {
+            () if expected.state != got.state => "state",
+            () if expected.image != got.image => "image",
+            () if before != after => "outcome",
+            () => "observation",
+        },
+        _ => "kind of reply",
+    }
 }
 
 async fn deterministic(subject: &Subject<'_>) -> Result<Tested> {

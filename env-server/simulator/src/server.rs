@@ -5,6 +5,7 @@
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow, ensure};
@@ -62,18 +63,31 @@ enum Work {
     Describe(Query),
     Open(Query),
     Request { session: String, bytes: zenoh::bytes::ZBytes },
-    Holder { session: String, is_alive: bool },
 }
 
 /// A session with what zenoh holds for it.
 struct Lease {
     session: Session,
     opened_at: Instant,
-    used_at: Instant,
-    is_held: bool,
+    signs: Arc<Mutex<Signs>>,
     publisher: Publisher<'static>,
     _requests: Subscriber<()>,
     _holder: Subscriber<()>,
+}
+
+/// What zenoh's threads write at once: a simulation thread that was busy for long must not take what
+/// waits in its queue for silence.
+#[derive(Clone, Copy)]
+struct Signs {
+    used_at: Instant,
+    holder: Holder,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Holder {
+    Awaited,
+    Alive,
+    Gone,
 }
 
 impl<'a> Server<'a> {
@@ -166,14 +180,6 @@ impl<'a> Server<'a> {
                 answer(&query, &self.keys.open(&self.id)?, encode(&opening)?);
             }
             Work::Request { session, bytes } => self.answer(&session, &bytes),
-            Work::Holder { session, is_alive } => {
-                let Some(lease) = self.leases.get_mut(&session) else { return Ok(()) };
-                if is_alive {
-                    lease.is_held = true;
-                } else if lease.is_held {
-                    self.end(&session, Some("its holder is gone"));
-                }
-            }
         }
         Ok(())
     }
@@ -238,33 +244,38 @@ impl<'a> Server<'a> {
             .express(true)
             .wait()
             .map_err(in_words)?;
-        let (enqueue, of) = (self.enqueuing(), name.clone());
+        let now = Instant::now();
+        let signs = Arc::new(Mutex::new(Signs { used_at: now, holder: Holder::Awaited }));
+        let (enqueue, of, seen) = (self.enqueuing(), name.clone(), Arc::clone(&signs));
         let requests = self
             .network
             .declare_subscriber(self.keys.request(&name)?)
             .callback(move |sample| {
+                locked(&seen).used_at = Instant::now();
                 enqueue(Work::Request { session: of.clone(), bytes: sample.payload().clone() });
             })
             .wait()
             .map_err(in_words)?;
-        let (enqueue, of) = (self.enqueuing(), name.clone());
+        let seen = Arc::clone(&signs);
         let holder_token = self
             .network
             .liveliness()
             .declare_subscriber(self.keys.session(&name)?)
             .history(true)
             .callback(move |sample| {
-                let is_alive = sample.kind() == SampleKind::Put;
-                enqueue(Work::Holder { session: of.clone(), is_alive });
+                let mut signs = locked(&seen);
+                signs.holder = match (sample.kind(), signs.holder) {
+                    (SampleKind::Put, _) => Holder::Alive,
+                    (SampleKind::Delete, Holder::Alive) => Holder::Gone,
+                    (SampleKind::Delete, before) => before,
+                };
             })
             .wait()
             .map_err(in_words)?;
-        let now = Instant::now();
         let lease = Lease {
             session,
             opened_at: now,
-            used_at: now,
-            is_held: false,
+            signs,
             publisher,
             _requests: requests,
             _holder: holder_token,
@@ -276,7 +287,6 @@ impl<'a> Server<'a> {
 
     fn answer(&mut self, name: &str, bytes: &zenoh::bytes::ZBytes) {
         let Some(lease) = self.leases.get_mut(name) else { return };
-        lease.used_at = Instant::now();
         let reply = match codec::check_size::<Request>(bytes.len()) {
             Ok(()) => lease.session.answer(&bytes.to_bytes(), &mut self.worlds),
             Err(error) => Some(refused(0, &error.to_string())),
@@ -290,10 +300,13 @@ impl<'a> Server<'a> {
         let idle_max = Duration::from_secs(self.options.idle_secs_max.into());
         let mut ended = Vec::new();
         for (name, lease) in &self.leases {
-            let idle = now.saturating_duration_since(lease.used_at);
+            let Signs { used_at, holder } = *locked(&lease.signs);
+            let idle = now.saturating_duration_since(used_at);
             if lease.session.closed && idle > CLOSED_WAIT_MAX {
                 ended.push((name.clone(), None));
-            } else if !lease.is_held
+            } else if holder == Holder::Gone {
+                ended.push((name.clone(), Some("its holder is gone".to_owned())));
+            } else if holder == Holder::Awaited
                 && now.saturating_duration_since(lease.opened_at) > HOLDER_WAIT_MAX
             {
                 let seconds = HOLDER_WAIT_MAX.as_secs();
@@ -333,6 +346,11 @@ impl<'a> Server<'a> {
     fn sessions(&self) -> u32 {
         self.leases.values().filter(|lease| !lease.session.closed).count() as u32
     }
+}
+
+/// Nothing that holds it can leave it half written.
+fn locked(signs: &Mutex<Signs>) -> MutexGuard<'_, Signs> {
+    signs.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// A reply that cannot be sent is asked for again, or its holder is gone.

@@ -1,0 +1,281 @@
+"""robosuite's environments behind the protocol: any of its tasks, any of its one-armed robots."""
+
+import copy
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
+from rever_env.protocol import Statistics
+from rever_env.world import Observation, Transition
+
+_CAMERA = "agentview"
+# What robosuite's documentation says each task is about.
+_INSTRUCTIONS = {
+    "Lift": "lift the cube",
+    "Stack": "stack the red cube on the green cube",
+    "PickPlace": "put every object into its bin",
+    "PickPlaceCan": "put the can into its bin",
+    "PickPlaceBread": "put the bread into its bin",
+    "PickPlaceCereal": "put the cereal into its bin",
+    "PickPlaceMilk": "put the milk into its bin",
+    "NutAssembly": "put both nuts on their pegs",
+    "NutAssemblySquare": "put the square nut on its peg",
+    "NutAssemblyRound": "put the round nut on its peg",
+    "Door": "open the door",
+    "Wipe": "wipe the table",
+    "ToolHang": "hang the tool on the frame",
+}
+# An object's own values, not what it refers to: numbers, and containers of them.
+_PLAIN = (np.ndarray, np.generic, float, int, bool, str, type(None))
+
+
+@dataclass(frozen=True)
+class RobosuiteTask:
+    """A task of robosuite with a robot, which is the protocol's variant."""
+
+    name: str
+    variant: str
+    instruction: str
+    steps_max: int
+    control_hz: float
+    version: int = 1
+    configurations: tuple[()] = ()  # robosuite draws every placement
+
+
+def offered(
+    names: Iterable[str], robots: Iterable[str], steps_max: int, control_hz: float
+) -> dict[str, RobosuiteTask]:
+    """Every named task with every named robot; InvalidPlacement for an unknown name."""
+    import robosuite
+
+    robots = list(robots)
+    for kind, given, known in (
+        ("task", names, robosuite.ALL_ENVIRONMENTS),
+        ("robot", robots, robosuite.ALL_ROBOTS),
+    ):
+        unknown = sorted(set(given) - set(known))
+        if unknown:
+            raise InvalidPlacement(f"{kind}s {unknown}: expected some of {sorted(known)}")
+    return {
+        f"{name}/{robot}": RobosuiteTask(
+            name, robot, _INSTRUCTIONS.get(name, name), steps_max, control_hz
+        )
+        for name in names
+        for robot in robots
+    }
+
+
+def simulator() -> str:
+    """Its name with its version."""
+    return f"robosuite {metadata.version('robosuite')}"
+
+
+class RobosuiteWorld:
+    """One robosuite environment with an operational-space controller (deltas in the base frame).
+
+    Not thread-safe: use it in the thread that made it. Moves beyond the controller's limit per step
+    are cut, as robosuite does. Statistics know success alone; what is grasped, robosuite does not
+    say of every task.
+    """
+
+    def __init__(self, task: RobosuiteTask, image_height: int, image_width: int) -> None:
+        import robosuite
+
+        self.task = task
+        self._size = (image_height, image_width)
+        has_image = self._size != (0, 0)
+        cameras = (
+            {"camera_heights": image_height, "camera_widths": image_width} if has_image else {}
+        )
+        self._environment: Any = robosuite.make(
+            task.name,
+            robots=task.variant,
+            has_renderer=False,
+            has_offscreen_renderer=has_image,
+            use_camera_obs=has_image,
+            camera_names=_CAMERA,
+            control_freq=task.control_hz,
+            ignore_done=True,
+            # Some models are drawn, too (a cube's size): the same one for every world, for a new
+            # one at each reset would cost a second.
+            hard_reset=False,
+            seed=0,
+            **cameras,
+        )
+        robots = self._environment.robots
+        if len(robots) != 1 or self._environment.action_dim != 7:
+            raise InvalidPlacement(
+                f"task {task.name} with {task.variant}: expected one arm and actions of 7 numbers, "
+                f"got {len(robots)} robots and {self._environment.action_dim} numbers"
+            )
+        self._robot = robots[0]
+        controllers = self._robot.part_controllers
+        self._arm = controllers[self._robot.arms[0]]
+        self._scale = np.asarray(self._arm.output_max, np.float64)
+        self._steps: int | None = None
+        self._ever_success = False
+        self._last: Observation | None = None
+
+    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+        """The same seed gives the same bytes: robosuite's generators are set again in place."""
+        if configuration is not None:
+            raise InvalidPlacement(
+                f"configuration {configuration}: expected 0 <= configuration < 0 "
+                f"for task {self.task.name}"
+            )
+        self._make_current()
+        environment = self._environment
+        # 1.5.2 ignores the seed that its Gymnasium wrapper is given; the placement sampler keeps
+        # the generator object, so that its state is what must be replaced.
+        environment.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
+        np.random.seed(seed % 2**32)
+        observation = environment.reset()
+        self._steps, self._ever_success = 0, False
+        return self._observe(observation)
+
+    def step(self, action: NDArray[np.float64]) -> Transition:
+        """action: float64 (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open)."""
+        steps = self._running()
+        if steps >= self.task.steps_max:
+            raise InvalidAction(f"step {steps + 1}: expected at most {self.task.steps_max}")
+        self._make_current()
+        # robosuite's gripper closes at +1.
+        command = np.concatenate([action[:6] / self._scale, [-action[6]]])
+        observation, reward, _, _ = self._environment.step(np.clip(command, -1.0, 1.0))
+        data = self._environment.sim.data
+        if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
+            self._steps = None
+            raise PhysicsDiverged(f"physics of {self.task.name} at step {steps}: got NaN")
+        self._steps = steps + 1
+        is_success = bool(self._environment._check_success())
+        self._ever_success |= is_success
+        return Transition(
+            observation=self._observe(observation),
+            statistics=Statistics(
+                is_success=is_success,
+                is_grasped=False,
+                ever_grasped=False,
+                consecutive_grasp=False,
+                moved_correct_object=False,
+                moved_wrong_object=False,
+                source_on_target=is_success,
+                ever_success=self._ever_success,
+                released_success=False,
+            ),
+            reward=float(reward),
+            terminated=False,
+            truncated=self._steps >= self.task.steps_max,
+        )
+
+    def save(self) -> Any:
+        """All of MuJoCo's data, and the plain values of everything that robosuite keeps beside it.
+
+        The whole data, for robosuite goes on from poses that are one physics step old.
+        """
+        self._running()
+        data = copy.copy(self._environment.sim.data._data)
+        kept = [copy.deepcopy(_plain(vars(part))) for part in self._parts()]
+        rng = copy.deepcopy(self._environment.rng.bit_generator.state)
+        return data, kept, rng, self._steps, self._ever_success, self._last
+
+    def restore(self, content: Any) -> Observation:
+        """Returns to a saved state of the same world."""
+        data, kept, rng, self._steps, self._ever_success, self._last = content
+        sim = self._environment.sim
+        mujoco.mj_copyData(sim.data._data, sim.model._model, data)
+        for part, values in zip(self._parts(), kept, strict=True):
+            vars(part).update(copy.deepcopy(values))
+        self._environment.rng.bit_generator.state = rng
+        assert self._last is not None, "what was saved had been seen"
+        return self._last
+
+    def expert_action(self) -> NDArray[np.float64]:
+        raise InvalidAction(f"task {self.task.name} has no scripted expert")
+
+    def close(self) -> None:
+        self._environment.close()
+
+    def _make_current(self) -> None:
+        """robosuite draws into whatever OpenGL context is current, which may be another world's."""
+        if self._size != (0, 0):
+            self._environment.sim._render_context_offscreen.gl_ctx.make_current()
+
+    def _running(self) -> int:
+        if self._steps is None:
+            raise InvalidAction("step or save before reset: expected a reset world")
+        return self._steps
+
+    def _parts(self) -> list[Any]:
+        """Whatever remembers something from one step to the next."""
+        robot = self._robot
+        parts = [self._environment, robot, robot.composite_controller]
+        parts += list(robot.part_controllers.values()) + list(robot.gripper.values())
+        buffers = [
+            buffer for part in parts for value in vars(part).values() for buffer in _buffers(value)
+        ]
+        observables = list(self._environment._observables.values())
+        return parts + buffers + observables
+
+    def _observe(self, observation: Any) -> Observation:
+        if self._size == (0, 0):
+            image = np.empty((0, 0, 3), np.uint8)
+        else:
+            # OpenGL's rows start at the bottom.
+            image = np.ascontiguousarray(observation[f"{_CAMERA}_image"][::-1])
+        self._last = Observation(image, self._state(), self.task.instruction)
+        return self._last
+
+    def _state(self) -> NDArray[np.float32]:
+        """x y z (m) roll pitch yaw (rad) in the base frame, pad 0, gripper opening 0 to 1."""
+        data, model = self._environment.sim.data, self._environment.sim.model
+        base = model.body_name2id(self._robot.robot_model.root_body)
+        site = model.site_name2id(
+            self._robot.gripper[self._robot.arms[0]].important_sites["grip_site"]
+        )
+        from_base = np.zeros(3)
+        axes = data.body_xmat[base].reshape(3, 3)
+        mujoco.mju_mulMatTVec(from_base, axes, data.site_xpos[site] - data.body_xpos[base])
+        turned = np.zeros((3, 3))
+        mujoco.mju_mulMatTMat(
+            turned, axes, np.ascontiguousarray(data.site_xmat[site].reshape(3, 3))
+        )
+        (xx, _, _), (yx, _, _), (zx, zy, zz) = turned.tolist()
+        roll = math.atan2(zy, zz)
+        pitch = math.atan2(-zx, math.sqrt(zy * zy + zz * zz))
+        yaw = math.atan2(yx, xx)
+        return np.array([*from_base, roll, pitch, yaw, 0.0, self._opening()], np.float32)
+
+    def _opening(self) -> float:
+        """Mean of the gripper's joints, each from its closed end (0) to its open one (1)."""
+        model, data = self._environment.sim.model, self._environment.sim.data
+        names = self._robot.gripper[self._robot.arms[0]].joints
+        shares = []
+        for name in names:
+            index = model.joint_name2id(name)
+            reach = float(np.abs(model.jnt_range[index]).max())
+            shares.append(abs(float(data.qpos[model.jnt_qposadr[index]])) / max(reach, 1e-9))
+        return min(max(sum(shares) / max(len(shares), 1), 0.0), 1.0)
+
+
+def _buffers(value: Any) -> list[Any]:
+    """robosuite's buffers of recent values, alone or by arm."""
+    values = list(value.values()) if isinstance(value, dict) else [value]
+    return [one for one in values if type(one).__module__.startswith("robosuite.utils.buffers")]
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    def is_plain(value: Any) -> bool:
+        if isinstance(value, (list, tuple)):
+            return all(is_plain(element) for element in value)
+        if isinstance(value, dict):
+            return all(is_plain(element) for element in value.values())
+        return isinstance(value, _PLAIN)
+
+    return {name: value for name, value in values.items() if is_plain(value)}
