@@ -198,12 +198,19 @@ class Server:
             lease.used_at = time.monotonic()
             enqueue(sample)
 
+        look = self._enqueuing(lambda _: self._end_abandoned(time.monotonic()))
+
+        def on_token(sample: Any) -> None:
+            lease.on_token(sample)
+            if lease.holder == "gone":
+                look(sample)  # at once, or with the next heartbeat if the queue is full
+
         lease.declared.append(
             self._network.declare_subscriber(self._keys.request(name), _direct(on_request))
         )
         lease.declared.append(
             self._network.liveliness().declare_subscriber(
-                self._keys.session(name), _direct(lease.on_token), history=True
+                self._keys.session(name), _direct(on_token), history=True
             )
         )
         _log.info("session %s opened for %s", name, opened.holder)

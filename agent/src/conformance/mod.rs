@@ -52,6 +52,7 @@ enum Tested {
 
 /// All rows, and whoever wants to see them as they come.
 struct Table<'a> {
+    subject: &'a Subject<'a>,
     rows: Vec<Row>,
     report: &'a mut dyn FnMut(&Row),
 }
@@ -64,7 +65,12 @@ impl Table<'_> {
         rule: &'static str,
         test: impl Future<Output = Result<Tested>>,
     ) {
-        let (verdict, reason) = match test.await {
+        let result = test.await;
+        if result.is_err() {
+            // What the test left open must not fail the next one.
+            self.subject.settle().await;
+        }
+        let (verdict, reason) = match result {
             Ok(Tested::Kept) => (Verdict::Pass, None),
             Ok(Tested::NotTested(reason)) => (Verdict::Skip, Some(reason)),
             Err(error) => (Verdict::Fail, Some(format!("{error:#}"))),
@@ -88,7 +94,7 @@ pub async fn test(
         "no server was to be seen that describes itself: check --connect, --fleet and its description",
     )?;
     let subject = Subject::new(network, description)?;
-    let mut table = Table { rows: Vec::new(), report };
+    let mut table = Table { subject: &subject, rows: Vec::new(), report };
     handshake::test(&subject, &mut table).await;
     numbers::test(&subject, &mut table).await;
     episodes::test(&subject, &mut table).await;

@@ -8,6 +8,8 @@ use protocol::{
     decode, encode,
 };
 
+use tokio::time::Instant;
+
 use crate::suite::SeedRange;
 use crate::wire::{Network, Probe};
 
@@ -15,6 +17,9 @@ use crate::wire::{Network, Probe};
 const REPLY_WAIT: Duration = Duration::from_secs(30);
 /// A server that answers what it should drop does so within this time.
 pub const SILENCE: Duration = Duration::from_secs(1);
+/// How long sessions of a failed test may take to end, and how often that is looked at.
+const SETTLE_WAIT_MAX: Duration = Duration::from_secs(3);
+const SETTLE_LOOK: Duration = Duration::from_millis(50);
 /// Of the images that are asked for: small, so that the tests are quick.
 const SIDE: u32 = 32;
 /// Nothing moves, and the gripper stays open.
@@ -47,6 +52,19 @@ impl<'a> Subject<'a> {
             description.server
         );
         Ok(Subject { network, description })
+    }
+
+    /// Waits for the end of sessions that nobody holds any more.
+    pub async fn settle(&self) {
+        let mut looks = tokio::time::interval(SETTLE_LOOK);
+        let deadline = Instant::now() + SETTLE_WAIT_MAX;
+        while Instant::now() < deadline {
+            looks.tick().await;
+            let now = self.network.describe(&self.description.server).await;
+            if now.is_ok_and(|now| now.sessions <= self.description.sessions) {
+                break;
+            }
+        }
     }
 
     /// The task that sessions are opened for.

@@ -62,7 +62,12 @@ pub struct Server<'a> {
 enum Work {
     Describe(Query),
     Open(Query),
-    Request { session: String, bytes: zenoh::bytes::ZBytes },
+    Request {
+        session: String,
+        bytes: zenoh::bytes::ZBytes,
+    },
+    /// A holder is gone.
+    Look,
 }
 
 /// A session with what zenoh holds for it.
@@ -180,6 +185,7 @@ impl<'a> Server<'a> {
                 answer(&query, &self.keys.open(&self.id)?, encode(&opening)?);
             }
             Work::Request { session, bytes } => self.answer(&session, &bytes),
+            Work::Look => self.end_abandoned(Instant::now()),
         }
         Ok(())
     }
@@ -256,7 +262,7 @@ impl<'a> Server<'a> {
             })
             .wait()
             .map_err(in_words)?;
-        let seen = Arc::clone(&signs);
+        let (enqueue, seen) = (self.enqueuing(), Arc::clone(&signs));
         let holder_token = self
             .network
             .liveliness()
@@ -269,6 +275,10 @@ impl<'a> Server<'a> {
                     (SampleKind::Delete, Holder::Alive) => Holder::Gone,
                     (SampleKind::Delete, before) => before,
                 };
+                if signs.holder == Holder::Gone {
+                    // At once, or with the next heartbeat if the queue is full.
+                    enqueue(Work::Look);
+                }
             })
             .wait()
             .map_err(in_words)?;
