@@ -39,7 +39,6 @@ pub mod verifier;
 // All of it together.
 pub mod campaign;
 pub mod collector;
-pub mod simulator;
 pub mod site;
 pub mod stop;
 
@@ -47,6 +46,7 @@ pub mod stop;
 pub mod report;
 pub mod servers;
 pub mod setup;
+pub mod simulator;
 pub mod video;
 
 // What it costs, and whether a server keeps to the protocol.

@@ -1,7 +1,8 @@
 """The world of the four Bridge tasks.
 
 tasks.toml -> tasks -> placement -> world (controller, success, camera, snapshot)
-world -> expert -> reasoning -> demonstrations; world -> gymnasium_env; world -> server
+world -> expert -> reasoning -> demonstrations; world -> gymnasium_env
+world, robosuite_world -> worlds -> session -> server
 server -> remote_session -> remote: the same as Gymnasium environments, in another process
 """
 

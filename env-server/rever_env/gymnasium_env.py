@@ -9,13 +9,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rever_env import tasks
+from rever_env.spaces import (
+    RANDOM_SEEDS,
+    check_render_mode,
+    configuration_of,
+    observation_space,
+)
 from rever_env.world import Observation, World
-
-_RANDOM_SEEDS = 1_000_000_000  # seeds drawn by reset(seed=None) lie below this
-
-# x y z (m, base frame), roll pitch yaw (rad), pad, gripper opening.
-_STATE_HIGH = np.array([2.0, 2.0, 2.0, np.pi, np.pi, np.pi, 1.0, 1.0], np.float32)
-_STATE_LOW = np.array([-2.0, -2.0, -2.0, -np.pi, -np.pi, -np.pi, 0.0, 0.0], np.float32)
 
 
 class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
@@ -35,21 +35,13 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         image_height: int = 128,
         image_width: int = 128,
     ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render mode: expected None or 'rgb_array', got {render_mode!r}")
+        check_render_mode(render_mode)
         self.render_mode = render_mode
         description = tasks.load()[task]
         self.world = World(description, image_height, image_width)
         self._last: Observation | None = None
-        characters = "".join(sorted(set(description.instruction)))
-        self.observation_space = spaces.Dict(
-            {
-                "image": spaces.Box(0, 255, (image_height, image_width, 3), np.uint8),
-                "state": spaces.Box(_STATE_LOW, _STATE_HIGH),
-                "instruction": spaces.Text(
-                    max_length=len(description.instruction), charset=characters
-                ),
-            }
+        self.observation_space = observation_space(
+            image_height, image_width, description.instruction
         )
         # SIMPLER allows turns up to pi / 2; 1 rad in 0.2 s is plenty and normalises the space.
         self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float64)
@@ -58,14 +50,9 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         super().reset(seed=seed)
-        options = options or {}
-        unknown = set(options) - {"configuration"}
-        if unknown:
-            raise ValueError(f"reset options: expected only 'configuration', got {sorted(unknown)}")
+        configuration = configuration_of(options)
         placement_seed = seed if seed is not None else self._drawn_seed()
-        self._last = self.world.reset(
-            configuration=options.get("configuration"), seed=placement_seed
-        )
+        self._last = self.world.reset(configuration=configuration, seed=placement_seed)
         return _fields(self._last), {"seed": placement_seed}
 
     def step(
@@ -90,7 +77,7 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         self.world.close()
 
     def _drawn_seed(self) -> int:
-        return int(self.np_random.integers(_RANDOM_SEEDS))
+        return int(self.np_random.integers(RANDOM_SEEDS))
 
 
 def _fields(observation: Observation) -> dict[str, Any]:

@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from rever_env import protocol
 from rever_env.remote_session import Fleet, RemoteFault, RemoteSession, holder
+from rever_env.spaces import (
+    RANDOM_SEEDS,
+    check_render_mode,
+    configuration_of,
+    observation_space,
+)
 
 Fields = dict[str, Any]
 Stepped = tuple[Fields, float, bool, bool, Fields]
-
-_RANDOM_SEEDS = 1_000_000_000  # seeds drawn by reset(seed=None) lie below this
-_STATE_HIGH = np.array([2.0, 2.0, 2.0, np.pi, np.pi, np.pi, 1.0, 1.0], np.float32)
-_STATE_LOW = np.array([-2.0, -2.0, -2.0, -np.pi, -np.pi, -np.pi, 0.0, 0.0], np.float32)
 
 
 class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
@@ -53,8 +55,7 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         wait_secs: float = 30.0,
         reply_secs: float = 120.0,
     ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render mode: expected None or 'rgb_array', got {render_mode!r}")
+        check_render_mode(render_mode)
         self.render_mode = render_mode
         endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
         self.session = RemoteSession(
@@ -71,15 +72,8 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         )
         self._last: protocol.Observation | None = None
         self._is_closed = False
-        instruction = self.session.task.instruction
-        self.observation_space = spaces.Dict(
-            {
-                "image": spaces.Box(0, 255, (image_height, image_width, 3), np.uint8),
-                "state": spaces.Box(_STATE_LOW, _STATE_HIGH),
-                "instruction": spaces.Text(
-                    max_length=max(len(instruction), 1), charset="".join(sorted(set(instruction)))
-                ),
-            }
+        self.observation_space = observation_space(
+            image_height, image_width, self.session.task.instruction
         )
         self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float32)
 
@@ -106,12 +100,8 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
     def send_reset(self, seed: int | None, options: Fields | None = None) -> None:
         """The first half of reset: returns before the server has answered."""
         super().reset(seed=seed)  # seeds the stream that later resets draw from
-        options = options or {}
-        unknown = set(options) - {"configuration"}
-        if unknown:
-            raise ValueError(f"reset options: expected only 'configuration', got {sorted(unknown)}")
-        self._seed = int(self.np_random.integers(_RANDOM_SEEDS)) if seed is None else seed
-        configuration, task = options.get("configuration"), self.session.task
+        configuration, task = configuration_of(options), self.session.task
+        self._seed = int(self.np_random.integers(RANDOM_SEEDS)) if seed is None else seed
         self.session.send(
             lambda sequence: protocol.Reset(
                 sequence, task.task, task.variant, configuration, self._seed

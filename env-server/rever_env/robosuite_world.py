@@ -1,7 +1,6 @@
 """robosuite's environments behind the protocol: any of its tasks, any of its one-armed robots."""
 
 import copy
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import metadata
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
+from rever_env.pose import in_base
 from rever_env.protocol import Statistics
 from rever_env.world import Observation, Transition
 
@@ -239,18 +239,10 @@ class RobosuiteWorld:
         site = model.site_name2id(
             self._robot.gripper[self._robot.arms[0]].important_sites["grip_site"]
         )
-        from_base = np.zeros(3)
-        axes = data.body_xmat[base].reshape(3, 3)
-        mujoco.mju_mulMatTVec(from_base, axes, data.site_xpos[site] - data.body_xpos[base])
-        turned = np.zeros((3, 3))
-        mujoco.mju_mulMatTMat(
-            turned, axes, np.ascontiguousarray(data.site_xmat[site].reshape(3, 3))
+        pose = in_base(
+            data.body_xpos[base], data.body_xmat[base], data.site_xpos[site], data.site_xmat[site]
         )
-        (xx, _, _), (yx, _, _), (zx, zy, zz) = turned.tolist()
-        roll = math.atan2(zy, zz)
-        pitch = math.atan2(-zx, math.sqrt(zy * zy + zz * zz))
-        yaw = math.atan2(yx, xx)
-        return np.array([*from_base, roll, pitch, yaw, 0.0, self._opening()], np.float32)
+        return np.array([*pose, 0.0, self._opening()], np.float32)
 
     def _opening(self) -> float:
         """Mean of the gripper's joints, each from its closed end (0) to its open one (1)."""

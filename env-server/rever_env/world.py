@@ -1,6 +1,5 @@
 """The world of one task: reset, step, save, restore, render."""
 
-import math
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -19,6 +18,7 @@ from rever_env.fault import (
     RendererUnavailable,
 )
 from rever_env.placement import place
+from rever_env.pose import in_base
 from rever_env.protocol import Statistics
 from rever_env.success import Judge, Memory
 from rever_env.tasks import Placement, Task
@@ -257,19 +257,10 @@ class World:
         data = self.data
         base = self.model.body(self.task.settings.robot_body).id
         site = self.model.site(self.task.settings.tcp).id
-        # MuJoCo's own products: numpy's may sum in another order on another processor.
-        world_from_base = data.xmat[base].reshape(3, 3)
-        position = np.zeros(3)
-        from_base = data.site_xpos[site] - data.xpos[base]
-        mujoco.mju_mulMatTVec(position, world_from_base, from_base)
-        in_base, attitude = np.zeros((3, 3)), np.zeros((3, 3))
-        mujoco.mju_mulMatTMat(in_base, world_from_base, data.site_xmat[site].reshape(3, 3))
-        mujoco.mju_mulMatMatT(attitude, in_base, _DOWN)
-        (xx, _, _), (yx, _, _), (zx, zy, zz) = attitude.tolist()
-        roll = math.atan2(zy, zz)
-        pitch = math.atan2(-zx, math.sqrt(zy * zy + zz * zz))
-        yaw = math.atan2(yx, xx)
-        return np.array([*position, roll, pitch, yaw, 0.0, self.gripper_opening()], np.float32)
+        pose = in_base(
+            data.xpos[base], data.xmat[base], data.site_xpos[site], data.site_xmat[site], _DOWN
+        )
+        return np.array([*pose, 0.0, self.gripper_opening()], np.float32)
 
 
 def _ignore(_warning: object) -> None:

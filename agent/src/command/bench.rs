@@ -96,21 +96,11 @@ struct WireArguments {
     #[arg(long, value_delimiter = ',', default_value = "1,8,32",
           value_parser = clap::value_parser!(u16).range(1..=64))]
     sessions: Vec<u16>,
-    /// Control steps of every session
-    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
-    steps: u32,
-    /// Height and width of the image
-    #[arg(long, default_value_t = 224, value_parser = clap::value_parser!(u32).range(1..=1024))]
-    side: u32,
     /// What the server is
     #[arg(long, value_enum, default_value_t)]
     simulator: Simulator,
-    /// A Python that has the packages of env-server, instead of the one that rever sets up
-    #[arg(long, value_name = "FILE")]
-    python: Option<PathBuf>,
-    /// Write the figures into this file, too
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    steps: StepsArguments,
 }
 
 /// Control steps of the Python and the native server, in turns, with an image and without
@@ -120,6 +110,13 @@ struct SimulatorsArguments {
     #[arg(long, value_delimiter = ',', default_value = "1,2,4,8",
           value_parser = clap::value_parser!(u16).range(1..=64))]
     sessions: Vec<u16>,
+    #[command(flatten)]
+    steps: StepsArguments,
+}
+
+/// What both benchmarks of control steps ask
+#[derive(Debug, Args)]
+struct StepsArguments {
     /// Control steps of every session
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
     steps: u32,
@@ -145,12 +142,13 @@ pub fn run(arguments: Arguments) -> Result<()> {
 }
 
 fn wire(arguments: WireArguments) -> Result<()> {
-    let site = site(1, arguments.simulator, arguments.python);
+    let site = site(1, arguments.simulator, arguments.steps.python.clone());
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
-    let steps = arguments.steps as usize;
-    let rows = WireBench { site: &site, sessions: &sessions, steps, side: arguments.side }.run()?;
-    if let Some(path) = &arguments.json {
-        write_json(path, &serde_json::json!({ "side": arguments.side, "rows": rows }))?;
+    let steps = arguments.steps.steps as usize;
+    let rows =
+        WireBench { site: &site, sessions: &sessions, steps, side: arguments.steps.side }.run()?;
+    if let Some(path) = &arguments.steps.json {
+        write_json(path, &serde_json::json!({ "side": arguments.steps.side, "rows": rows }))?;
     }
     println!(
         "{:>8} {:>7} {:>9} {:>9} {:>9} {:>8}",
@@ -167,17 +165,18 @@ fn wire(arguments: WireArguments) -> Result<()> {
             100.0 * row.wire_ms_p50 / row.step_ms_p50
         );
     }
-    println!("one server, {0} x {0} pixels; per step, medians", arguments.side);
+    println!("one server, {0} x {0} pixels; per step, medians", arguments.steps.side);
     Ok(())
 }
 
 fn simulators(arguments: SimulatorsArguments) -> Result<()> {
-    let site = site(1, Simulator::Python, arguments.python);
+    let site = site(1, Simulator::Python, arguments.steps.python.clone());
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
-    let steps = arguments.steps as usize;
-    let bench = SimulatorsBench { site: &site, sessions: &sessions, steps, side: arguments.side };
+    let steps = arguments.steps.steps as usize;
+    let bench =
+        SimulatorsBench { site: &site, sessions: &sessions, steps, side: arguments.steps.side };
     let rows = bench.run()?;
-    if let Some(path) = &arguments.json {
+    if let Some(path) = &arguments.steps.json {
         write_json(path, &rows)?;
     }
     println!(

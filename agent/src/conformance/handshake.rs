@@ -5,7 +5,7 @@ use std::time::Duration;
 use anyhow::{Result, anyhow, ensure};
 use protocol::{Open, Opening, PROTOCOL_VERSION, encode, limits};
 
-use super::subject::{Subject, names};
+use super::subject::{Subject, names, unchecked};
 use super::{Table, Tested};
 use crate::wire::Probe;
 
@@ -121,9 +121,4 @@ async fn refusal(subject: &Subject<'_>, payload: Vec<u8>) -> Result<String> {
         Opening::Refused { reason } => Ok(reason),
         Opening::Opened { .. } => Err(anyhow!("expected Refused, got Opened")),
     }
-}
-
-/// The bytes of a message that our own codec would not send.
-fn unchecked(open: &Open) -> Vec<u8> {
-    rmp_serde::to_vec_named(open).expect("an Open can be written")
 }

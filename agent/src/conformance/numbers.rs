@@ -3,7 +3,7 @@
 use anyhow::{Result, ensure};
 use protocol::{Reply, Request, decode, encode, limits};
 
-use super::subject::{HOLD_STILL, MOVE, SILENCE, Subject, Talk, names};
+use super::subject::{HOLD_STILL, MOVE, SILENCE, Subject, Talk, names, unchecked};
 use super::{Table, Tested};
 
 pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
@@ -146,9 +146,4 @@ async fn silent(talk: &mut Talk) -> Result<()> {
     let reply = talk.probe.receive(SILENCE).await;
     ensure!(reply.is_none(), "expected silence, got {} bytes", reply.unwrap_or_default().len());
     Ok(())
-}
-
-/// The bytes of a message that our own codec would not send.
-fn unchecked(request: &Request) -> Vec<u8> {
-    rmp_serde::to_vec_named(request).expect("a request can be written")
 }

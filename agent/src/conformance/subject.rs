@@ -8,6 +8,7 @@ use protocol::{
     decode, encode,
 };
 
+use serde::Serialize;
 use tokio::time::Instant;
 
 use crate::suite::SeedRange;
@@ -209,6 +210,11 @@ fn words(reply: &Reply) -> &str {
         Reply::Refused { reason, .. } | Reply::Faulted { reason, .. } => reason,
         _ => "",
     }
+}
+
+/// The bytes of a message that our own codec would not send.
+pub fn unchecked(message: &impl Serialize) -> Vec<u8> {
+    rmp_serde::to_vec_named(message).expect("a message can be written")
 }
 
 /// Fails unless a reason names what it is about.
