@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from rever_env import __main__, protocol, server, session, world
 
 Session: Any = session.Session
@@ -125,6 +126,12 @@ def other_size() -> None:
         original(self, replace(opened, image_height=opened.image_width), worlds)
 
 
+def any_length() -> None:
+    @wrap(World, "step")
+    def step(original: Any, self: Any, action: Any) -> Any:
+        return original(self, np.resize(np.append(action, 0.0), 7))
+
+
 DEFECTS = {
     function.__name__: function
     for function in (
@@ -142,6 +149,7 @@ DEFECTS = {
         no_limit,
         forgets_close,
         other_size,
+        any_length,
     )
 }
 

@@ -2,13 +2,25 @@
 
 use std::io::Write;
 
+use agent::setup::{PythonEnvironment, simulators_environment};
+
 use crate::harness::{python, repository, succeed};
 
 #[test]
 fn the_environment_server_passes_its_tests() {
-    let mut pytest = python().command();
+    pytest(python(), &[]);
+}
+
+#[test]
+fn the_other_simulators_pass_their_tests() {
+    let environment = simulators_environment(repository()).expect("the simulators are set up");
+    pytest(&environment, &["tests/test_robosuite.py", "tests/test_gymnasium_world.py"]);
+}
+
+fn pytest(environment: &PythonEnvironment, files: &[&str]) {
+    let mut pytest = environment.command();
     pytest.current_dir(repository().join("env-server"));
-    let said = succeed(pytest.args(["-m", "pytest", "--quiet"]));
+    let said = succeed(pytest.args(["-m", "pytest", "--quiet"]).args(files));
     // Written past the capture of the test runner, so that every run shows how many tests passed.
     let closing = said.lines().next_back().unwrap_or_default();
     writeln!(std::io::stderr(), "pytest: {closing}").expect("standard error is open");

@@ -2,9 +2,10 @@
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
+use agent::setup::simulators_environment;
 use agent::simulator::{ServerProgram, Simulator};
 use agent::suite::TASKS;
 use serde_json::Value;
@@ -13,7 +14,7 @@ use crate::harness::{python, repository, rever, run, succeed, text};
 use crate::server::free_endpoint;
 
 /// Rows of the suite that a server with the defects must fail, and no others.
-const BROKEN: [(&str, &[&str]); 6] = [
+const BROKEN: [(&str, &[&str]); 7] = [
     ("answers_older,never_ends,other_size", &["older", "horizon", "observation"]),
     ("repeats_twice", &["repeated", "close"]),
     (
@@ -27,6 +28,7 @@ const BROKEN: [(&str, &[&str]); 6] = [
             "size",
             "number_limit",
             "values",
+            "dimensions",
             "slots",
             "deterministic",
             "concurrent",
@@ -34,6 +36,7 @@ const BROKEN: [(&str, &[&str]); 6] = [
     ),
     ("jumps_gaps,forgets_command,steps_unreset", &["gap", "save", "reset_first"]),
     ("one_seed,no_limit", &["seeds", "sessions_max"]),
+    ("forgets_close,any_length", &["close", "dimensions"]),
     ("keeps_leases", &["holder_gone", "holder_missing", "idle"]),
 ];
 
@@ -120,12 +123,42 @@ fn conformance(arguments: &[&str]) -> (BTreeSet<String>, usize, String) {
 
 #[test]
 fn our_servers_conform() {
-    for server in ["python", "native"] {
+    for server in ["python", "native", "robosuite"] {
         let (failed, passed, said) = conformance(&["--server", server]);
         assert!(failed.is_empty(), "{server}: {said}");
         assert_eq!(passed, said.lines().filter(|line| line.starts_with("pass ")).count());
-        assert!(!said.contains("skip "), "{server}: {said}");
+        // No number of a Bridge action is discrete.
+        let skipped: Vec<&str> = said.lines().filter(|line| line.starts_with("skip ")).collect();
+        assert!(matches!(skipped[..], [only] if only.contains(" discrete ")), "{server}: {said}");
     }
+}
+
+#[test]
+fn a_gymnasium_environment_conforms() {
+    let python = simulators_environment(repository()).expect("the simulators are set up");
+    let mut command = python.command();
+    command.args(["-m", "rever_env", "serve", "--gymnasium", "CartPole-v1"]);
+    let (failed, passed, said) = conformance_of(&mut command);
+    assert!(failed.is_empty(), "{said}");
+    // Its action is discrete: no row has nothing to test.
+    assert_eq!(passed, said.lines().filter(|line| !line.contains(" passed, ")).count(), "{said}");
+}
+
+/// Of a server that is started with this command and the options that a test needs.
+fn conformance_of(command: &mut Command) -> (BTreeSet<String>, usize, String) {
+    let endpoint = free_endpoint();
+    let mut server = command
+        .args(["--sessions", "4", "--idle-secs", "12"])
+        .args(["--exit-with-parent", "--listen", &endpoint])
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the server starts");
+    let rows = conformance(&["--connect", &endpoint]);
+    server.kill().expect("the server runs");
+    server.wait().expect("a killed server ends");
+    rows
 }
 
 #[test]
@@ -141,20 +174,9 @@ fn a_broken_server_fails_every_row_that_it_should() {
 }
 
 fn assert_failures(defects: &str, rows: &[&str]) {
-    let endpoint = free_endpoint();
-    let mut server = python()
-        .command()
-        .arg(repository().join("tests/broken_server.py"))
-        .args([defects, "serve", "--sessions", "4", "--idle-secs", "12"])
-        .args(["--exit-with-parent", "--listen", &endpoint])
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("the server starts");
-    let (failed, _, said) = conformance(&["--connect", &endpoint]);
-    server.kill().expect("the server runs");
-    server.wait().expect("a killed server ends");
+    let mut command = python().command();
+    command.arg(repository().join("tests/broken_server.py")).args([defects, "serve"]);
+    let (failed, _, said) = conformance_of(&mut command);
     let expected: BTreeSet<String> = rows.iter().copied().map(str::to_owned).collect();
     assert_eq!(failed, expected, "{defects}: {said}");
 }

@@ -96,7 +96,7 @@ async fn trajectory(network: &Network, server: &str) -> Result<Vec<Vec<u8>>, Env
         if step == 6 {
             episode.save(2).await?;
         }
-        let action = episode.observation().expert_action.expect("the expert was asked for");
+        let action = episode.expert_action().expect("the expert was asked for");
         let transition = episode.step(action).await?;
         bytes
             .push(encode(&Reply::Stepped { sequence: 1, transition }).expect("a valid transition"));

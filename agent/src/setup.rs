@@ -11,12 +11,15 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail, ensure};
 use sha2::{Digest, Sha256};
 
+/// Where everything lies.
+const FOLDER: &str = ".venv";
 /// The oldest Python that the locked packages support.
 const PYTHON_VERSION_MIN: (u32, u32) = (3, 10);
 /// Tried in this order; the first that is new enough is taken.
 const PYTHON_NAMES: [&str; 7] =
     ["python3", "python3.14", "python3.13", "python3.12", "python3.11", "python3.10", "python"];
 const RUNTIME_LOCK: &str = "env-server/requirements.lock";
+const SIMULATORS_LOCK: &str = "env-server/requirements-simulators.lock";
 const DEVELOPMENT_LOCK: &str = "env-server/requirements-development.lock";
 /// The same names on Debian 12 and 13 and on Ubuntu 22.04 and 24.04. `libopengl0` holds the entry
 /// points that MuJoCo loads, `libegl1` the off-screen context, `libgl1-mesa-dri` the software
@@ -74,12 +77,18 @@ pub fn repository() -> Result<PathBuf> {
 /// Makes sure that this machine has what the servers need: packages in the repository's `.venv`,
 /// and software OpenGL. Fast when that was done before.
 pub fn python_environment(repository: &Path) -> Result<PythonEnvironment> {
-    environment_with(repository, &[RUNTIME_LOCK])
+    environment_with(repository, FOLDER, &[RUNTIME_LOCK])
+}
+
+/// A Python apart from the servers' own, with robosuite, Gymnasium's environments and gymnasium-robotics: robosuite's
+/// packages and the servers' newest do not go together.
+pub fn simulators_environment(repository: &Path) -> Result<PythonEnvironment> {
+    environment_with(repository, ".venv/simulators", &[SIMULATORS_LOCK])
 }
 
 /// Like [`python_environment`], with the tools that only the tests need.
 pub fn development_environment(repository: &Path) -> Result<PythonEnvironment> {
-    environment_with(repository, &[RUNTIME_LOCK, DEVELOPMENT_LOCK])
+    environment_with(repository, FOLDER, &[RUNTIME_LOCK, DEVELOPMENT_LOCK])
 }
 
 /// Makes sure that a frame can be rendered without a screen or a graphics card.
@@ -91,8 +100,8 @@ pub fn software_gl(environment: &PythonEnvironment) -> Result<()> {
         .context("no frame could be rendered, though software OpenGL was just installed")
 }
 
-fn environment_with(repository: &Path, locks: &[&str]) -> Result<PythonEnvironment> {
-    let folder = repository.join(".venv");
+fn environment_with(repository: &Path, folder: &str, locks: &[&str]) -> Result<PythonEnvironment> {
+    let folder = repository.join(folder);
     let environment = PythonEnvironment {
         python: folder.join("bin/python"),
         package_root: repository.join("env-server"),
@@ -111,7 +120,7 @@ fn environment_with(repository: &Path, locks: &[&str]) -> Result<PythonEnvironme
         // Another process may have done it while this one waited.
         if !is_stamped(&environment, &stamp, &wanted) {
             install(&environment, &folder, &locked)?;
-            if *lock == RUNTIME_LOCK {
+            if *lock != DEVELOPMENT_LOCK {
                 software_gl(&environment)?;
             }
             std::fs::write(&stamp, &wanted)

@@ -8,8 +8,9 @@ use clap::ValueEnum;
 use serde_json::Value;
 
 use crate::setup::{self, PythonEnvironment};
+use crate::suite::TASKS;
 
-/// One of ours; they give the same bytes.
+/// One of ours. `Python` and `Native` give the same bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum Simulator {
     /// `python -m rever_env serve`.
@@ -17,6 +18,8 @@ pub enum Simulator {
     Python,
     /// `rever-simulator`, built when it is first asked for.
     Native,
+    /// The Bridge tasks in robosuite, with its controllers; packages of its own are set up when it is first asked for.
+    Robosuite,
 }
 
 /// A program that serves worlds, ready to be started.
@@ -24,6 +27,8 @@ pub enum Simulator {
 pub enum ServerProgram {
     /// The package `rever_env`.
     Python(PythonEnvironment),
+    /// The same, with the Bridge tasks in robosuite.
+    Robosuite(PythonEnvironment),
     /// The program `rever-simulator`.
     Native {
         /// The program.
@@ -34,18 +39,27 @@ pub enum ServerProgram {
 }
 
 impl ServerProgram {
-    /// Makes sure that the simulator can be started; the native one is linked with `python`'s own MuJoCo.
+    /// Makes sure that the simulator can be started on `python`; the native one is linked with its MuJoCo.
     pub fn prepare(simulator: Simulator, python: PythonEnvironment) -> Result<ServerProgram> {
         Ok(match simulator {
             Simulator::Python => ServerProgram::Python(python),
+            Simulator::Robosuite => ServerProgram::Robosuite(python),
             Simulator::Native => native(&setup::repository()?, &python)?,
         })
+    }
+
+    /// What its `serve` needs to be told beside the common options.
+    pub fn serve_arguments(&self) -> Vec<&'static str> {
+        match self {
+            ServerProgram::Robosuite(_) => [&["--robosuite"][..], &TASKS].concat(),
+            ServerProgram::Python(_) | ServerProgram::Native { .. } => Vec::new(),
+        }
     }
 
     /// The program without its subcommand.
     pub fn command(&self) -> Command {
         match self {
-            ServerProgram::Python(environment) => {
+            ServerProgram::Python(environment) | ServerProgram::Robosuite(environment) => {
                 let mut command = environment.command();
                 command.args(["-m", "rever_env"]);
                 command

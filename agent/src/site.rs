@@ -52,7 +52,7 @@ impl Site {
         ServerProgram::prepare(self.simulator, self.python_environment()?)
     }
 
-    /// The Python that local servers run on.
+    /// The Python that local servers run on, set up when it is first asked for.
     pub fn python_environment(&self) -> Result<PythonEnvironment> {
         let repository = setup::repository()?;
         match &self.python {
@@ -60,7 +60,10 @@ impl Site {
                 python: python.clone(),
                 package_root: repository.join("env-server"),
             }),
-            None => setup::python_environment(&repository),
+            None => match self.simulator {
+                Simulator::Robosuite => setup::simulators_environment(&repository),
+                Simulator::Python | Simulator::Native => setup::python_environment(&repository),
+            },
         }
     }
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rever_env.success import norm
+from rever_env.success import Judge, Memory, norm
 from rever_env.tasks import Task
-
-if TYPE_CHECKING:
-    from rever_env.world import World
 
 Vector = NDArray[np.float64]
 
@@ -32,6 +29,22 @@ HEIGHT_TOLERANCE = 0.006
 TURN_TOLERANCE = 0.15  # rad
 METRES_PER_RADIAN = 0.04  # weighs a turn error against a horizontal one in the funnel
 OPEN_MIN = 0.034  # finger joint position that counts as open, metres
+
+
+class Stage(Protocol):
+    """A running episode in MuJoCo, whoever steps it; task has the names of its model."""
+
+    @property
+    def model(self) -> mujoco.MjModel: ...
+    @property
+    def data(self) -> mujoco.MjData: ...
+    @property
+    def task(self) -> Task: ...
+    @property
+    def judge(self) -> Judge: ...
+    def running_memory(self) -> Memory:
+        """The statistics' memory."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -63,13 +76,13 @@ class Decision:
 SUBTASKS = ("reach", "grasp", "lift", "move", "release", "done")
 
 
-def look(world: World) -> Sight:
-    """Reads the sight from a world; changes nothing."""
-    model, data, task = world.model, world.data, world.task
-    memory = world.running_memory()
+def look(stage: Stage) -> Sight:
+    """Reads the sight from a running episode; changes nothing."""
+    model, data, task = stage.model, stage.data, stage.task
+    memory = stage.running_memory()
     source, target = model.body(task.source).id, model.body(task.target).id
     site = model.site(task.settings.tcp).id
-    touch = world.judge.touch(data)
+    touch = stage.judge.touch(data)
     source_axes = data.xmat[source].reshape(3, 3)
     finger_axes = data.site_xmat[site].reshape(3, 3)
     base = model.body(task.settings.robot_body).id
@@ -83,8 +96,8 @@ def look(world: World) -> Sight:
         source_angle=math.atan2(source_axes[1, 0], source_axes[0, 0]),
         target_centre=data.xipos[target].copy(),
         target_origin=data.xpos[target].copy(),
-        held=world.judge.grasped(data, touch),
-        on_target=world.judge.on_target(data, memory, touch),
+        held=stage.judge.grasped(data, touch),
+        on_target=stage.judge.on_target(data, memory, touch),
         world_from_base=data.xmat[base].reshape(3, 3).copy(),
     )
 

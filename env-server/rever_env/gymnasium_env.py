@@ -41,10 +41,9 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         self.world = World(description, image_height, image_width)
         self._last: Observation | None = None
         self.observation_space = observation_space(
-            image_height, image_width, description.instruction
+            image_height, image_width, description.instruction, description.state
         )
-        # SIMPLER allows turns up to pi / 2; 1 rad in 0.2 s is plenty and normalises the space.
-        self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float64)
+        self.action_space = spaces.Box(-1.0, 1.0, (len(description.action),), np.float64)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -15,6 +15,7 @@ from rever_env import protocol
 from rever_env.remote_session import Fleet, RemoteFault, RemoteSession, holder
 from rever_env.spaces import (
     RANDOM_SEEDS,
+    action_space,
     check_render_mode,
     configuration_of,
     observation_space,
@@ -28,11 +29,14 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
     """One session of a server that speaks protocol/README.md, whatever simulator it is.
 
     connect: endpoints of servers or a router, as tcp/HOST:PORT, or one of them.
-    task: by default the first that the server offers.
-    observation: image uint8 (height, width, 3), state float32 (8,) in Bridge's order, instruction.
-    action: float32 (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open).
+    task: by default the first that the server offers. variant: "default" of a named task.
+    observation: image uint8 (height, width, 3), state float32 (n,), instruction text.
+    action: float32 (n,), or a whole number where the task has a choice of actions. What the numbers
+    are, session.task.state and session.task.action say; of a Bridge task see BridgeEnv. Without
+    images (0 x 0 pixels, or a server that has none) or numbers that part of the observation is left
+    out.
     reset options: {"configuration": 0..} for a fixed placement; otherwise the seed draws one.
-    expert: info has "expert_action", float32 (7,), what the server's scripted expert would do.
+    expert: info has "expert_action", float32 (n,), what the server's scripted expert would do.
     wait_secs: for a server to be there; reply_secs: for a reply, whatever is sent again meanwhile.
     Raises RemoteFault when the world or the way to it breaks, which is never a reward, and
     RemoteRefused when the server refuses a request.
@@ -44,7 +48,7 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         self,
         connect: str | tuple[str, ...],
         task: str | None = None,
-        variant: str = "default",
+        variant: str | None = None,
         image_height: int = 128,
         image_width: int = 128,
         *,
@@ -58,24 +62,35 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         check_render_mode(render_mode)
         self.render_mode = render_mode
         endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-        self.session = RemoteSession(
-            Fleet(endpoints, fleet, server, wait_secs, reply_secs),
-            lambda first: protocol.Open(
+
+        def opening(description: protocol.Description) -> protocol.Open:
+            side_max = description.image_side_max  # 0: it has no images
+            first = description.tasks[0]
+            return protocol.Open(
                 protocol.PROTOCOL_VERSION,
                 first.task if task is None else task,
-                variant,
-                image_height,
-                image_width,
+                (first.variant if task is None else "default") if variant is None else variant,
+                image_height if side_max else 0,
+                image_width if side_max else 0,
                 expert,
                 holder(),
-            ),
+            )
+
+        self.session = RemoteSession(
+            Fleet(endpoints, fleet, server, wait_secs, reply_secs), opening
         )
         self._last: protocol.Observation | None = None
         self._is_closed = False
         self.observation_space = observation_space(
-            image_height, image_width, self.session.task.instruction
+            self.session.opened.image_height,
+            self.session.opened.image_width,
+            self.session.task.instruction,
+            self.session.task.state,
         )
-        self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float32)
+        self._names = set(self.observation_space.spaces)
+        if "image" not in self._names:
+            self.render_mode = None
+        self.action_space: spaces.Space[Any] = action_space(self.session.task.action)
 
     def reset(
         self, *, seed: int | None = None, options: Fields | None = None
@@ -118,8 +133,11 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
     def send_step(self, action: NDArray[np.float32]) -> None:
         """The first half of step."""
         numbers = np.asarray(action, np.float32)
-        if numbers.shape != (7,):
-            raise ValueError(f"action: expected shape (7,), got {numbers.shape}")
+        if numbers.shape != self.action_space.shape:
+            raise ValueError(
+                f"action: expected shape {self.action_space.shape}, got {numbers.shape}"
+            )
+        numbers = numbers.reshape(-1)
         self.session.send(lambda sequence: protocol.Step(sequence, tuple(numbers.tolist())))
 
     def receive_step(self) -> Stepped:
@@ -134,11 +152,12 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
 
     def _fields(self, observation: protocol.Observation) -> Fields:
         self._last = observation
-        return {
+        fields = {
             "image": _image(observation),
             "state": np.array(observation.state, np.float32),
             "instruction": observation.instruction,
         }
+        return {name: value for name, value in fields.items() if name in self._names}
 
     def _hints(self) -> Fields:
         if self._last is None or self._last.expert_action is None:
@@ -214,7 +233,7 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Fields, NDArray[Any], NDArray[Any], NDArray[Any], Fields]:
-        """actions: float32 (environments, 7)."""
+        """actions: one for each environment."""
         if len(actions) != self.num_envs:
             raise ValueError(f"actions: expected {self.num_envs} of them, got {len(actions)}")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():

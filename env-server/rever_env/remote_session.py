@@ -44,10 +44,8 @@ class Fleet:
 class RemoteSession:
     """Requests are numbered and sent again until a reply comes; close() ends the session."""
 
-    def __init__(
-        self, fleet: Fleet, ask: Callable[[protocol.TaskDescription], protocol.Open]
-    ) -> None:
-        """ask: turns the description of the server's first task into what is opened."""
+    def __init__(self, fleet: Fleet, ask: Callable[[protocol.Description], protocol.Open]) -> None:
+        """ask: turns the server's description into what is opened."""
         self._fleet = fleet
         self._keys = protocol.Keys(fleet.fleet)
         endpoints = Endpoints(fleet.connect, (), multicast=False, wait_secs=fleet.wait_secs)
@@ -105,11 +103,11 @@ class RemoteSession:
             declared.undeclare()
         self._network.close()  # type: ignore[no-untyped-call]
 
-    def _open(self, ask: Callable[[protocol.TaskDescription], protocol.Open]) -> None:
+    def _open(self, ask: Callable[[protocol.Description], protocol.Open]) -> None:
         description = self._find()
         self.server = description.server
         self.description = description
-        opened = ask(description.tasks[0])
+        opened = self.opened = ask(description)
         wanted = [
             task
             for task in description.tasks

@@ -1,7 +1,7 @@
 """robosuite's environments behind the protocol: any of its tasks, any of its one-armed robots."""
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rever_env import tasks
 from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
 from rever_env.pose import in_base
-from rever_env.protocol import Statistics
-from rever_env.world import Observation, Transition
+from rever_env.protocol import Dimension, Statistics
+from rever_env.world import DOWN, Observation, Transition
 
-_CAMERA = "agentview"
 # What robosuite's documentation says each task is about.
 _INSTRUCTIONS = {
     "Lift": "lift the cube",
@@ -38,38 +38,73 @@ _PLAIN = (np.ndarray, np.generic, float, int, bool, str, type(None))
 
 @dataclass(frozen=True)
 class RobosuiteTask:
-    """A task of robosuite with a robot, which is the protocol's variant."""
+    """A task of robosuite with a robot, which is the protocol's variant; or a Bridge task in it."""
 
     name: str
     variant: str
     instruction: str
     steps_max: int
-    control_hz: float
+    state: tuple[Dimension, ...]
+    action: tuple[Dimension, ...]
+    making: Mapping[str, Any]  # for robosuite.make
+    camera: str = "agentview"
     version: int = 1
-    configurations: tuple[()] = ()  # robosuite draws every placement
+    configurations: tuple[Any, ...] = ()  # robosuite draws every placement of its own tasks
+    is_bridge: bool = False
 
 
 def offered(
     names: Iterable[str], robots: Iterable[str], steps_max: int, control_hz: float
 ) -> dict[str, RobosuiteTask]:
-    """Every named task with every named robot; InvalidPlacement for an unknown name."""
+    """Every named task with every named robot; InvalidPlacement for an unknown name.
+
+    A Bridge task has its own robot, horizon and rate of control.
+    """
     import robosuite
 
-    robots = list(robots)
+    bridge = tasks.load()
+    own = {name: _bridge(bridge[name]) for name in names if name in bridge}
+    names, robots = [name for name in names if name not in own], list(robots)
     for kind, given, known in (
-        ("task", names, robosuite.ALL_ENVIRONMENTS),
+        ("task", names, {*robosuite.ALL_ENVIRONMENTS, *bridge}),
         ("robot", robots, robosuite.ALL_ROBOTS),
     ):
         unknown = sorted(set(given) - set(known))
         if unknown:
             raise InvalidPlacement(f"{kind}s {unknown}: expected some of {sorted(known)}")
-    return {
+    # What a Bridge task has: RobosuiteWorld brings robosuite's own to it.
+    any_bridge = next(iter(bridge.values()))
+    return own | {
         f"{name}/{robot}": RobosuiteTask(
-            name, robot, _INSTRUCTIONS.get(name, name), steps_max, control_hz
+            name,
+            robot,
+            _INSTRUCTIONS.get(name, name),
+            steps_max,
+            any_bridge.state,
+            any_bridge.action,
+            {"env_name": name, "robots": robot, "control_freq": control_hz},
         )
         for name in names
         for robot in robots
     }
+
+
+def _bridge(task: tasks.Task) -> RobosuiteTask:
+    from rever_env import robosuite_bridge
+
+    return RobosuiteTask(
+        task.name,
+        task.variant,
+        task.instruction,
+        task.steps_max,
+        task.state,
+        task.action,
+        {"env_name": robosuite_bridge.ENVIRONMENTS[task.name]},
+        robosuite_bridge.CAMERA,
+        task.version,
+        task.configurations,
+        is_bridge=True,
+    )
 
 
 def simulator() -> str:
@@ -81,8 +116,7 @@ class RobosuiteWorld:
     """One robosuite environment with an operational-space controller (deltas in the base frame).
 
     Not thread-safe: use it in the thread that made it. Moves beyond the controller's limit per step
-    are cut, as robosuite does. Statistics know success alone; what is grasped, robosuite does not
-    say of every task.
+    are cut, as robosuite does. Statistics of its own tasks know success alone.
     """
 
     def __init__(self, task: RobosuiteTask, image_height: int, image_width: int) -> None:
@@ -95,13 +129,11 @@ class RobosuiteWorld:
             {"camera_heights": image_height, "camera_widths": image_width} if has_image else {}
         )
         self._environment: Any = robosuite.make(
-            task.name,
-            robots=task.variant,
+            **task.making,
             has_renderer=False,
             has_offscreen_renderer=has_image,
             use_camera_obs=has_image,
-            camera_names=_CAMERA,
-            control_freq=task.control_hz,
+            camera_names=task.camera,
             ignore_done=True,
             # Some models are drawn, too (a cube's size): the same one for every world, for a new
             # one at each reset would cost a second.
@@ -125,20 +157,22 @@ class RobosuiteWorld:
 
     def reset(self, *, configuration: int | None, seed: int) -> Observation:
         """The same seed gives the same bytes: robosuite's generators are set again in place."""
+        environment = self._environment
+        self._steps, self._ever_success = 0, False
+        if self.task.is_bridge:
+            self._make_current()
+            return self._observe(environment.begin(configuration, seed))
         if configuration is not None:
             raise InvalidPlacement(
                 f"configuration {configuration}: expected 0 <= configuration < 0 "
                 f"for task {self.task.name}"
             )
         self._make_current()
-        environment = self._environment
         # 1.5.2 ignores the seed that its Gymnasium wrapper is given; the placement sampler keeps
         # the generator object, so that its state is what must be replaced.
         environment.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
         np.random.seed(seed % 2**32)
-        observation = environment.reset()
-        self._steps, self._ever_success = 0, False
-        return self._observe(observation)
+        return self._observe(environment.reset())
 
     def step(self, action: NDArray[np.float64]) -> Transition:
         """action: float64 (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open)."""
@@ -146,6 +180,8 @@ class RobosuiteWorld:
         if steps >= self.task.steps_max:
             raise InvalidAction(f"step {steps + 1}: expected at most {self.task.steps_max}")
         self._make_current()
+        if action.shape != (7,):
+            raise InvalidAction(f"action: expected shape (7,), got {action.shape}")
         # robosuite's gripper closes at +1.
         command = np.concatenate([action[:6] / self._scale, [-action[6]]])
         observation, reward, _, _ = self._environment.step(np.clip(command, -1.0, 1.0))
@@ -154,24 +190,31 @@ class RobosuiteWorld:
             self._steps = None
             raise PhysicsDiverged(f"physics of {self.task.name} at step {steps}: got NaN")
         self._steps = steps + 1
-        is_success = bool(self._environment._check_success())
-        self._ever_success |= is_success
         return Transition(
             observation=self._observe(observation),
-            statistics=Statistics(
-                is_success=is_success,
-                is_grasped=False,
-                ever_grasped=False,
-                consecutive_grasp=False,
-                moved_correct_object=False,
-                moved_wrong_object=False,
-                source_on_target=is_success,
-                ever_success=self._ever_success,
-                released_success=False,
-            ),
+            statistics=self._judged(),
             reward=float(reward),
             terminated=False,
             truncated=self._steps >= self.task.steps_max,
+        )
+
+    def _judged(self) -> Statistics:
+        """Of its own tasks robosuite knows success alone."""
+        if self.task.is_bridge:
+            statistics: Statistics = self._environment.judged()
+            return statistics
+        is_success = bool(self._environment._check_success())
+        self._ever_success |= is_success
+        return Statistics(
+            is_success=is_success,
+            is_grasped=False,
+            ever_grasped=False,
+            consecutive_grasp=False,
+            moved_correct_object=False,
+            moved_wrong_object=False,
+            source_on_target=is_success,
+            ever_success=self._ever_success,
+            released_success=False,
         )
 
     def save(self) -> Any:
@@ -183,11 +226,14 @@ class RobosuiteWorld:
         data = copy.copy(self._environment.sim.data._data)
         kept = [copy.deepcopy(_plain(vars(part))) for part in self._parts()]
         rng = copy.deepcopy(self._environment.rng.bit_generator.state)
-        return data, kept, rng, self._steps, self._ever_success, self._last
+        memory = copy.deepcopy(self._environment.memory) if self.task.is_bridge else None
+        return data, kept, rng, memory, self._steps, self._ever_success, self._last
 
     def restore(self, content: Any) -> Observation:
         """Returns to a saved state of the same world."""
-        data, kept, rng, self._steps, self._ever_success, self._last = content
+        data, kept, rng, memory, self._steps, self._ever_success, self._last = content
+        if self.task.is_bridge:
+            self._environment.memory = copy.deepcopy(memory)
         sim = self._environment.sim
         mujoco.mj_copyData(sim.data._data, sim.model._model, data)
         for part, values in zip(self._parts(), kept, strict=True):
@@ -197,7 +243,11 @@ class RobosuiteWorld:
         return self._last
 
     def expert_action(self) -> NDArray[np.float64]:
-        raise InvalidAction(f"task {self.task.name} has no scripted expert")
+        if not self.task.is_bridge:
+            raise InvalidAction(f"task {self.task.name} has no scripted expert")
+        self._running()
+        action: NDArray[np.float64] = self._environment.expert_action()
+        return action
 
     def close(self) -> None:
         self._environment.close()
@@ -228,7 +278,7 @@ class RobosuiteWorld:
             image = np.empty((0, 0, 3), np.uint8)
         else:
             # OpenGL's rows start at the bottom.
-            image = np.ascontiguousarray(observation[f"{_CAMERA}_image"][::-1])
+            image = np.ascontiguousarray(observation[f"{self.task.camera}_image"][::-1])
         self._last = Observation(image, self._state(), self.task.instruction)
         return self._last
 
@@ -240,7 +290,11 @@ class RobosuiteWorld:
             self._robot.gripper[self._robot.arms[0]].important_sites["grip_site"]
         )
         pose = in_base(
-            data.body_xpos[base], data.body_xmat[base], data.site_xpos[site], data.site_xmat[site]
+            data.body_xpos[base],
+            data.body_xmat[base],
+            data.site_xpos[site],
+            data.site_xmat[site],
+            DOWN if self.task.is_bridge else None,
         )
         return np.array([*pose, 0.0, self._opening()], np.float32)
 

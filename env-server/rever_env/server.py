@@ -26,8 +26,6 @@ from rever_env.worlds import UnknownTask, Worlds
 
 _log = logging.getLogger(__name__)
 
-STATE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "pad", "gripper")
-ACTION_NAMES = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "gripper")
 _BEAT_SECS = 0.5
 _HOLDER_SECS_MAX = 10.0  # from opening a session to its holder's token
 _CLOSED_SECS_MAX = 10.0  # a closed session still answers: its last reply may have been lost
@@ -151,12 +149,12 @@ class Server:
                     instruction=task.instruction,
                     steps_max=task.steps_max,
                     configurations=len(task.configurations),
+                    state=task.state,
+                    action=task.action,
                 )
                 for task in self._worlds.tasks.values()
             ),
-            state=STATE_NAMES,
-            action=ACTION_NAMES,
-            image_side_max=limits.IMAGE_SIDE_MAX,
+            image_side_max=self._worlds.image_side_max,
             sessions=self._sessions(),
             sessions_max=self._options.sessions_max,
             slots_max=limits.SLOTS_MAX,

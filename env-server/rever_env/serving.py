@@ -9,7 +9,7 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rever_env.protocol import limits
 
@@ -48,19 +48,55 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--id-file", type=Path, help="write the server's id there when it is ready, for health"
     )
-    parser.add_argument(
-        "--robosuite", nargs="+", metavar="TASK", help="offer robosuite's tasks instead of ours"
+    _add_other_worlds(parser)
+    parser.set_defaults(run=serve)
+
+
+def _add_other_worlds(parser: argparse.ArgumentParser) -> None:
+    others = parser.add_argument_group("worlds other than the Bridge tasks")
+    kinds = others.add_mutually_exclusive_group()
+    kinds.add_argument("--robosuite", nargs="+", metavar="TASK", help="robosuite's tasks, by name")
+    kinds.add_argument(
+        "--gymnasium", nargs="+", metavar="ID", help="Gymnasium's environments, by id"
     )
-    parser.add_argument(
-        "--robots", nargs="+", default=["Panda"], metavar="ROBOT", help="(default: Panda)"
+    others.add_argument(
+        "--robots",
+        nargs="+",
+        default=["Panda"],
+        metavar="ROBOT",
+        help="robosuite's (default: Panda)",
     )
-    parser.add_argument(
-        "--horizon", type=int, default=500, help="control steps of robosuite's tasks (default: 500)"
-    )
-    parser.add_argument(
+    others.add_argument(
         "--control-hz", type=float, default=20.0, help="of robosuite's tasks (default: 20)"
     )
-    parser.set_defaults(run=serve)
+    others.add_argument(
+        "--import",
+        dest="imports",
+        nargs="+",
+        default=[],
+        metavar="PACKAGE",
+        help="packages that register Gymnasium ids",
+    )
+    others.add_argument(
+        "--arguments", type=_arguments, default={}, metavar="JSON", help="for gymnasium.make"
+    )
+    others.add_argument(
+        "--wrapper", metavar="MODULE:CLASS", help="put around each Gymnasium environment"
+    )
+    others.add_argument(
+        "--horizon",
+        type=int,
+        default=500,
+        help="control steps of tasks that have no limit of their own (default: 500)",
+    )
+
+
+def _arguments(text: str) -> dict[str, Any]:
+    """ValueError, which argparse turns into its own words, for anything but a JSON object."""
+    arguments = json.loads(text)
+    if not isinstance(arguments, dict):
+        raise argparse.ArgumentTypeError(f"expected a JSON object, got {text}")
+    return arguments
 
 
 @dataclass(frozen=True)
@@ -154,18 +190,39 @@ def serve(arguments: argparse.Namespace) -> int:
 
 
 def _worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
-    from rever_env import robosuite_world, tasks
+    from rever_env import tasks
     from rever_env.worlds import Worlds
 
-    if not arguments.robosuite:
-        return Worlds(tasks.load(), idle_max)
-    return Worlds(
-        robosuite_world.offered(
+    if arguments.robosuite:
+        from rever_env import robosuite_world
+
+        offered = robosuite_world.offered(
             arguments.robosuite, arguments.robots, arguments.horizon, arguments.control_hz
-        ),
+        )
+        return Worlds(
+            offered, idle_max, robosuite_world.RobosuiteWorld, robosuite_world.simulator()
+        )
+    if arguments.gymnasium:
+        return _gymnasium_worlds(arguments, idle_max)
+    return Worlds(tasks.load(), idle_max)
+
+
+def _gymnasium_worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
+    from rever_env import gymnasium_world
+    from rever_env.worlds import Worlds
+
+    wrapper = gymnasium_world.imported(arguments.wrapper) if arguments.wrapper else None
+    making = gymnasium_world.Making(arguments.arguments, wrapper)
+    offered = gymnasium_world.offered(
+        arguments.gymnasium, arguments.imports, making, arguments.horizon
+    )
+    has_images = any(task.has_image for task in offered.values())
+    return Worlds(
+        offered,
         idle_max,
-        robosuite_world.RobosuiteWorld,
-        robosuite_world.simulator(),
+        gymnasium_world.GymnasiumWorld,
+        gymnasium_world.simulator(arguments.imports),
+        limits.IMAGE_SIDE_MAX if has_images else 0,
     )
 
 

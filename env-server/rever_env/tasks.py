@@ -11,6 +11,7 @@ else:
     import tomli as tomllib
 
 from rever_env.fault import InvalidPlacement
+from rever_env.protocol import Dimension
 
 Triple = tuple[float, float, float]
 Range = tuple[float, float]
@@ -117,6 +118,8 @@ class Task:
     settings: WorldSettings
     inverse_kinematics: InverseKinematics
     grasp: GraspRule
+    state: tuple[Dimension, ...]
+    action: tuple[Dimension, ...]
 
 
 def load(assets: Path | None = None) -> dict[str, Task]:
@@ -127,6 +130,7 @@ def load(assets: Path | None = None) -> dict[str, Task]:
     settings = WorldSettings(**_tuples(description["world"]))
     inverse_kinematics = InverseKinematics(**description["inverse_kinematics"])
     grasp = GraspRule(**description["grasp"])
+    state, action = _dimensions(description["state"]), _dimensions(description["action"])
     tasks = {}
     for index, (name, table) in enumerate(description["tasks"].items()):
         fields = _tuples(table)
@@ -141,6 +145,8 @@ def load(assets: Path | None = None) -> dict[str, Task]:
             settings=settings,
             inverse_kinematics=inverse_kinematics,
             grasp=grasp,
+            state=state,
+            action=action,
             **fields,
         )
     return tasks
@@ -151,6 +157,10 @@ def _assets_folder() -> Path:
     package = Path(__file__).resolve().parent
     inside = package / "assets"
     return inside if inside.is_dir() else package.parent / "assets"
+
+
+def _dimensions(rows: list[dict[str, Any]]) -> tuple[Dimension, ...]:
+    return tuple(Dimension(discrete=False, **row) for row in rows)
 
 
 def _tuples(table: dict[str, Any]) -> dict[str, Any]:

@@ -40,7 +40,7 @@ _START_GAP = 0.002  # objects start this far above rest, metres
 # edge and spins at more than 100 rad/s.
 _SPEED_MAX = 1000.0
 # Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
-_DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class World:
         joints = np.array(self.task.robot_joints)
         self.data.qpos[: len(joints)] = joints
         self.data.ctrl[:] = joints
-        self._place_objects(placement)
+        place_objects(self.model, self.data, self.task, placement)
         self._settle()
         self.steps = 0
         self.controller.reset(self.data)
@@ -174,20 +174,6 @@ class World:
             raise InvalidAction("step, save or expert before reset: expected a reset world")
         return self.memory
 
-    def _place_objects(self, placement: Placement) -> None:
-        task = self.task
-        rows = [(task.source, placement.source_x, placement.source_y, task.source_height)]
-        yaws = [placement.source_yaw]
-        if task.target_height is not None:
-            rows.append((task.target, placement.target_x, placement.target_y, task.target_height))
-            yaws.append(0.0)
-        for (name, x, y, height), yaw in zip(rows, yaws, strict=True):
-            start = self.model.joint(name).qposadr[0]
-            self.data.qpos[start : start + 3] = (x, y, height + _START_GAP)
-            quaternion = np.zeros(4)
-            mujoco.mju_axisAngle2Quat(quaternion, np.array([0.0, 0.0, 1.0]), np.deg2rad(yaw))
-            self.data.qpos[start + 3 : start + 7] = quaternion
-
     def _settle(self) -> None:
         """Lets the objects come to rest, as SIMPLER does after its drop (which is left out)."""
         settings = self.task.settings
@@ -258,9 +244,26 @@ class World:
         base = self.model.body(self.task.settings.robot_body).id
         site = self.model.site(self.task.settings.tcp).id
         pose = in_base(
-            data.xpos[base], data.xmat[base], data.site_xpos[site], data.site_xmat[site], _DOWN
+            data.xpos[base], data.xmat[base], data.site_xpos[site], data.site_xmat[site], DOWN
         )
         return np.array([*pose, 0.0, self.gripper_opening()], np.float32)
+
+
+def place_objects(
+    model: mujoco.MjModel, data: mujoco.MjData, task: Task, placement: Placement
+) -> None:
+    """Puts source and target above where they will rest."""
+    rows = [(task.source, placement.source_x, placement.source_y, task.source_height)]
+    yaws = [placement.source_yaw]
+    if task.target_height is not None:
+        rows.append((task.target, placement.target_x, placement.target_y, task.target_height))
+        yaws.append(0.0)
+    for (name, x, y, height), yaw in zip(rows, yaws, strict=True):
+        start = model.joint(name).qposadr[0]
+        data.qpos[start : start + 3] = (x, y, height + _START_GAP)
+        quaternion = np.zeros(4)
+        mujoco.mju_axisAngle2Quat(quaternion, np.array([0.0, 0.0, 1.0]), np.deg2rad(yaw))
+        data.qpos[start + 3 : start + 7] = quaternion
 
 
 def _ignore(_warning: object) -> None:

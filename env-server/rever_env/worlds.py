@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rever_env.protocol import Dimension, limits
 from rever_env.world import Observation, Transition, World
 
 Key = tuple[str, str, int, int]
@@ -28,6 +29,10 @@ class OfferedTask(Protocol):
     def steps_max(self) -> int: ...
     @property
     def configurations(self) -> Sized: ...
+    @property
+    def state(self) -> tuple[Dimension, ...]: ...
+    @property
+    def action(self) -> tuple[Dimension, ...]: ...
 
 
 class AnyWorld(Protocol):
@@ -67,6 +72,7 @@ class Worlds:
 
     A world carries nothing from one episode to the next, so it does not matter which one a session
     gets. idle_max: worlds kept that no session uses; making one takes tens of milliseconds.
+    image_side_max: 0 when the worlds have no images.
     """
 
     def __init__(
@@ -75,8 +81,10 @@ class Worlds:
         idle_max: int,
         make: Maker = World,
         simulator: str = "rever_env",
+        image_side_max: int = limits.IMAGE_SIDE_MAX,
     ) -> None:
         self.simulator = simulator
+        self.image_side_max = image_side_max
         self.tasks = {(task.name, task.variant): task for task in tasks.values()}
         self._idle_max = idle_max
         self._make = make

@@ -29,6 +29,14 @@ OBSERVATION = protocol.Observation(
     instruction="put the spoon on the towel",
     expert_action=None,
 )
+STATE_OF = (
+    protocol.Dimension("x", -2.0, 2.0, False),
+    protocol.Dimension("height", -0.0, None, False),
+)
+ACTION_OF = (
+    protocol.Dimension("x", -0.5, 0.5, False),
+    protocol.Dimension("gripper", -1.0, 1.0, True),
+)
 ACTION = (0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0)
 STATISTICS = protocol.Statistics(False, False, True, False, True, False, False, False, False)
 TRANSITION = protocol.Transition(
@@ -41,7 +49,9 @@ EXAMPLES: dict[str, Any] = {
         simulator="rever_env",
         simulator_version="0.0.0 mujoco 3.8.0",
         tasks=(
-            protocol.TaskDescription(SPOON, "default", 1, "put the spoon on the towel", 60, 24),
+            protocol.TaskDescription(
+                SPOON, "default", 1, "put the spoon on the towel", 60, 24, STATE_OF, ACTION_OF
+            ),
             protocol.TaskDescription(
                 "widowx_put_eggplant_in_basket",
                 "default",
@@ -49,10 +59,10 @@ EXAMPLES: dict[str, Any] = {
                 "put eggplant into yellow basket",
                 120,
                 24,
+                STATE_OF,
+                ACTION_OF,
             ),
         ),
-        state=("x", "y", "z", "roll", "pitch", "yaw", "pad", "gripper"),
-        action=("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "gripper"),
         image_side_max=1024,
         sessions=3,
         sessions_max=16,

@@ -54,6 +54,45 @@ def test_the_checker_passes_over_the_wire_without_a_warning(endpoint: str) -> No
         environment.close()
 
 
+def test_a_gymnasium_environment_is_the_same_behind_a_server() -> None:
+    endpoint = free_endpoint()
+    process = serve(endpoint, "--gymnasium", "CartPole-v1")
+    remote = rever_env.RemoteEnv(endpoint, image_height=0, image_width=0)
+    local = gymnasium.make("CartPole-v1")
+    assert remote.session.task.task == "CartPole-v1"
+    assert remote.action_space == gymnasium.spaces.Discrete(2)
+    fields: Any = remote.observation_space
+    assert fields["state"] == gymnasium.spaces.Box(
+        np.array([-4.8, -np.inf, -0.41887903, -np.inf], np.float32),
+        np.array([4.8, np.inf, 0.41887903, np.inf], np.float32),
+    )
+    observation, _ = remote.reset(seed=3)
+    expected, _ = local.reset(seed=3)
+    terminated = False
+    while not terminated:
+        assert set(observation) == {"state", "instruction"}
+        assert np.array_equal(observation["state"], expected)
+        action = int(expected[2] < 0.01)
+        observation, reward, terminated, truncated, info = remote.step(np.int64(action))
+        expected, *same = local.step(action)
+        assert (reward, terminated, truncated) == tuple(same[:3])
+        assert not info["is_success"]
+    with pytest.raises(RemoteRefused, match="it has ended"):
+        remote.step(np.int64(0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # CartPole's speeds have no bound, of which the checker warns there, too.
+        warnings.filterwarnings("ignore", message=".*A Box observation space")
+        made = gymnasium.make(
+            "rever_env:rever/Remote-v1", connect=endpoint, image_height=0, image_width=0
+        )
+        check_env(made.unwrapped, skip_close_check=True)
+    made.close()
+    remote.close()
+    process.kill()
+    process.wait()
+
+
 def test_it_is_the_same_world(endpoint: str, task: Task, world: World) -> None:
     remote = rever_env.RemoteEnv(endpoint, task.name, expert=True)
     observation, info = remote.reset(seed=9, options={"configuration": 4})

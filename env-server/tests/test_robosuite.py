@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from rever_env import tasks
 from rever_env.fault import InvalidAction, InvalidPlacement
-from rever_env.world import Observation
+from rever_env.world import Observation, World
 
 pytest.importorskip("robosuite")
 
@@ -18,11 +19,11 @@ MOVE = np.array([0.01, 0.005, -0.01, 0.0, 0.0, 0.05, -1.0])
 @pytest.fixture(scope="module")
 def worlds() -> Iterator[list[RobosuiteWorld]]:
     """Two of one kind and one of another, in the same thread."""
-    tasks = offered(["Lift", "Stack"], ["Panda"], 6, 20.0)
+    offers = offered(["Lift", "Stack"], ["Panda"], 6, 20.0)
     worlds = [
-        RobosuiteWorld(tasks["Lift/Panda"], 24, 40),
-        RobosuiteWorld(tasks["Lift/Panda"], 24, 40),
-        RobosuiteWorld(tasks["Stack/Panda"], 32, 32),
+        RobosuiteWorld(offers["Lift/Panda"], 24, 40),
+        RobosuiteWorld(offers["Lift/Panda"], 24, 40),
+        RobosuiteWorld(offers["Stack/Panda"], 32, 32),
     ]
     yield worlds
     for world in worlds:
@@ -83,3 +84,49 @@ def test_what_is_wrong_is_said(worlds: list[RobosuiteWorld]) -> None:
     world.step(MOVE)
     with pytest.raises(InvalidAction, match="step 7: expected at most 6"):
         world.step(MOVE)
+
+
+@pytest.fixture(scope="module")
+def bridge() -> Iterator[RobosuiteWorld]:
+    """A Bridge task with robosuite's controller."""
+    world = RobosuiteWorld(offered(["widowx_stack_cube"], [], 6, 20.0)["widowx_stack_cube"], 24, 40)
+    yield world
+    world.close()
+
+
+def test_a_bridge_task_starts_where_ours_does(bridge: RobosuiteWorld) -> None:
+    seen = bridge.reset(configuration=5, seed=0)
+    with World(tasks.load()["widowx_stack_cube"], 24, 40) as ours:
+        expected = ours.reset(configuration=5, seed=0)
+    assert np.abs(seen.state - expected.state).max() < 0.01
+    assert seen.instruction == expected.instruction
+    # Another renderer's settings and another solver's, but the same scene.
+    difference = seen.image.astype(float) - expected.image.astype(float)
+    assert np.abs(difference).mean() < 10.0
+
+
+def test_bridge_tasks_are_reproducible_and_saved_exactly(bridge: RobosuiteWorld) -> None:
+    expected = run(bridge, 7)
+    run(bridge, 8)
+    again = run(bridge, 7)
+    assert all(same(*pair) for pair in zip(expected, again, strict=True))
+    saved = bridge.save()
+    after = [bridge.step(MOVE) for _ in range(3)]
+    bridge.reset(configuration=0, seed=0)
+    bridge.restore(saved)
+    for transition in after:
+        repeated = bridge.step(MOVE)
+        assert same(repeated.observation, transition.observation)
+        assert repeated.statistics == transition.statistics
+
+
+@pytest.mark.parametrize("task", list(tasks.load()))
+def test_the_expert_solves_the_bridge_tasks_in_robosuite(task: str) -> None:
+    world = RobosuiteWorld(offered([task], [], 6, 20.0)[task], 0, 0)
+    world.reset(configuration=None, seed=2_000_000_000)
+    transition = world.step(world.expert_action())
+    while not transition.truncated:
+        transition = world.step(world.expert_action())
+    world.close()
+    assert transition.statistics.ever_grasped and transition.statistics.is_success
+    assert transition.reward == 1.0

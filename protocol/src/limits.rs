@@ -36,7 +36,7 @@ pub const SLOTS_MAX: u32 = 16;
 pub const SESSIONS_MAX: u32 = 256;
 /// First seed that is too large: seeds fit a double, so that every language can hold them.
 pub const SEED_END: u64 = 1 << 53;
-/// Values of an action: translation in metres, rotation vector in radians, gripper +1 open or -1 closed.
-pub const ACTION_LENGTH: usize = 7;
-/// Values of a state, in Bridge's order: x y z roll pitch yaw pad gripper.
-pub const STATE_LENGTH: usize = 8;
+/// Numbers of an action: a `Step` with so many is within its limit.
+pub const ACTION_DIMENSIONS_MAX: usize = 128;
+/// Numbers of a state.
+pub const STATE_DIMENSIONS_MAX: usize = ELEMENTS_MAX;

@@ -1,12 +1,19 @@
 //! One example of each message; the values are exact in 32 bits, so that both languages write the same numbers.
 
 use protocol::{
-    Description, EpisodeOutcome, FaultKind, Heartbeat, Image, Observation, Open, Opening,
-    PROTOCOL_VERSION, Reply, Request, Statistics, TaskDescription, Transition, VerifierUpdate,
+    Description, Dimension, EpisodeOutcome, FaultKind, Heartbeat, Image, Observation, Open,
+    Opening, PROTOCOL_VERSION, Reply, Request, Statistics, TaskDescription, Transition,
+    VerifierUpdate,
 };
 
 pub fn description() -> Description {
-    let names = |text: &str| text.split(' ').map(str::to_owned).collect();
+    let dimension = |name: &str, bound: f32, discrete| Dimension {
+        name: name.into(),
+        low: Some(-bound),
+        high: Some(bound),
+        discrete,
+    };
+    let height = Dimension { high: None, ..dimension("height", 0.0, false) };
     let task = |task: &str, instruction: &str, steps_max| TaskDescription {
         task: task.into(),
         variant: "default".into(),
@@ -14,6 +21,8 @@ pub fn description() -> Description {
         instruction: instruction.into(),
         steps_max,
         configurations: 24,
+        state: vec![dimension("x", 2.0, false), height.clone()],
+        action: vec![dimension("x", 0.5, false), dimension("gripper", 1.0, true)],
     };
     Description {
         protocol: PROTOCOL_VERSION,
@@ -24,8 +33,6 @@ pub fn description() -> Description {
             task("widowx_spoon_on_towel", "put the spoon on the towel", 60),
             task("widowx_put_eggplant_in_basket", "put eggplant into yellow basket", 120),
         ],
-        state: names("x y z roll pitch yaw pad gripper"),
-        action: names("x y z rotation_x rotation_y rotation_z gripper"),
         image_side_max: 1024,
         sessions: 3,
         sessions_max: 16,
@@ -65,7 +72,7 @@ pub fn openings() -> [(&'static str, Opening); 2] {
 pub fn observation() -> Observation {
     Observation {
         image: Image { height: 2, width: 3, pixels: (0..18).map(|index| index * 14).collect() },
-        state: [0.25, -0.125, 0.5, 0.0, -1.5, 3.0, 0.0, 1.0],
+        state: vec![0.25, -0.125, 0.5, 0.0, -1.5, 3.0, 0.0, 1.0],
         instruction: "put the spoon on the towel".into(),
         expert_action: None,
     }
@@ -76,7 +83,7 @@ pub fn statistics() -> Statistics {
 }
 
 pub fn transition() -> Transition {
-    let expert_action = Some([0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0]);
+    let expert_action = Some(vec![0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0]);
     Transition {
         observation: Observation { expert_action, ..observation() },
         statistics: statistics(),
@@ -94,7 +101,7 @@ pub fn requests() -> [(&'static str, Request); 6] {
         configuration,
         seed,
     };
-    let action = [0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0];
+    let action = vec![0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0];
     [
         ("request_reset", reset(1, Some(23), 7)),
         ("request_reset_random", reset(300, None, (1 << 53) - 1)),

@@ -174,6 +174,11 @@ fn the_readme_states_every_limit() {
         format!("image sides 1 to {}, or 0 x 0", limits::IMAGE_SIDE_MAX),
         format!("slots 0 to {}", limits::SLOTS_MAX - 1),
         format!("seeds below 2^{}", limits::SEED_END.ilog2()),
+        format!(
+            "an action has 1 to {} numbers, a state up to {}",
+            limits::ACTION_DIMENSIONS_MAX,
+            limits::STATE_DIMENSIONS_MAX
+        ),
     ] {
         assert!(found.contains(&sentence), "the README does not say: {sentence}");
     }

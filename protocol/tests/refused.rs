@@ -1,6 +1,6 @@
 //! Bytes that must be refused, and the words for it; `golden/refused/` keeps them for the Python tests.
 
-use protocol::{Message, Open, PROTOCOL_VERSION, Reply, Request, decode, encode};
+use protocol::{Description, Message, Open, PROTOCOL_VERSION, Reply, Request, decode, encode};
 use serde_json::{Map, Value, json};
 
 use crate::{examples, golden};
@@ -170,12 +170,11 @@ fn field_cases() -> Vec<Case> {
 }
 
 fn length_cases() -> Vec<Case> {
-    let six = changed(changed(step(), &[0x97], &[0x96]), &float(0.015625), &[]);
-    let eight = changed(
-        changed(step(), &[0x97], &[0x98]),
-        &float(0.015625),
-        &[float(0.0), float(0.0)].concat(),
-    );
+    let seven: Vec<u8> = [0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0].map(float).concat();
+    let seven = [&[0x97], &seven[..]].concat();
+    let none = changed(step(), &seven, &[0x90]);
+    let many = [&[0xdc, 0, 129], &float(0.0).repeat(129)[..]].concat();
+    let many = changed(step(), &seven, &many);
     let pixels = examples::observation().image.pixels;
     let as_text = changed(
         stepped(),
@@ -185,8 +184,18 @@ fn length_cases() -> Vec<Case> {
     let name_as_bytes =
         changed(reset(), b"\xb5widowx_spoon_on_towel", b"\xc4\x15widowx_spoon_on_towel");
     vec![
-        case("six_values", "request", six, "invalid length 6, expected an array of 7 f32"),
-        case("eight_values", "request", eight, "invalid length 8, expected an array of 7 f32"),
+        case(
+            "no_values",
+            "request",
+            none,
+            "request is invalid: action: expected 1 to 128 numbers, got 0",
+        ),
+        case(
+            "many_values",
+            "request",
+            many,
+            "request is invalid: action: expected 1 to 128 numbers, got 129",
+        ),
         case(
             "text_not_utf8",
             "request",
@@ -264,7 +273,28 @@ fn peer_cases() -> Vec<Case> {
         &[&[0xc4, 18], &pixels[..]].concat(),
         &[&[0xc4, 17], &pixels[..17]].concat(),
     );
+    let described = valid(&examples::description());
+    let high_at = |value: f32| [b"\xa4high", &float(value)[..]].concat();
+    let low_at = |value: f32| [b"\xa3low", &float(value)[..]].concat();
     vec![
+        case(
+            "bounds_crossed",
+            "description",
+            changed(described.clone(), &low_at(-0.5), &low_at(1.0)),
+            "description is invalid: dimension x: expected low <= high, got 1 and 0.5",
+        ),
+        case(
+            "bounds_not_whole",
+            "description",
+            changed(described.clone(), &high_at(1.0), &high_at(0.5)),
+            "description is invalid: dimension gripper: expected whole bounds, for it is discrete",
+        ),
+        case(
+            "bounds_missing",
+            "description",
+            changed(described, &high_at(1.0), b"\xa4high\xc0"),
+            "description is invalid: dimension gripper: expected whole bounds, for it is discrete",
+        ),
         case("protocol", "open", future, "open is invalid: expected protocol 1, got protocol 2"),
         case(
             "protocol_and_fields",
@@ -298,6 +328,7 @@ fn refusal(case: &Case) -> String {
         "request" => decode::<Request>(&case.bytes).map(drop),
         "reply" => decode::<Reply>(&case.bytes).map(drop),
         "open" => decode::<Open>(&case.bytes).map(drop),
+        "description" => decode::<Description>(&case.bytes).map(drop),
         other => panic!("no case decodes {other}"),
     };
     error.expect_err(case.name).to_string()
@@ -346,7 +377,7 @@ fn the_refused_bytes_are_kept_for_the_other_language() {
 
 #[test]
 fn an_invalid_message_is_not_written() {
-    let error = encode(&Request::Step { sequence: 1, action: [f32::NAN; 7] }).expect_err("NaN");
+    let error = encode(&Request::Step { sequence: 1, action: vec![f32::NAN; 7] }).expect_err("NaN");
     assert_eq!(
         error.to_string(),
         "request is invalid: action: expected finite numbers, got nan at index 0"

@@ -3,7 +3,7 @@
 use anyhow::{Result, bail, ensure};
 use protocol::{Open, Reply, Request, decode};
 
-use super::subject::{HOLD_STILL, MOVE, Subject, Talk, names};
+use super::subject::{Subject, Talk, names};
 use super::{Table, Tested};
 
 /// Steps that are compared.
@@ -13,7 +13,7 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row("reset_first", "Step, Save and Restore before the first Reset are refused", async {
             let mut talk = subject.talk().await?;
-            talk.refused(|sequence| Request::Step { sequence, action: HOLD_STILL }).await?;
+            talk.refused(|sequence| Request::Step { sequence, action: subject.still() }).await?;
             talk.refused(|sequence| Request::Save { sequence, slot: 0 }).await?;
             talk.refused(|sequence| Request::Restore { sequence, slot: 0 }).await?;
             talk.reset(0).await?;
@@ -24,7 +24,7 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row(
             "observation",
-            "an observation has the image that was asked for, and no expert's action",
+            "an observation has the image that was asked for, the state described, no expert's action",
             observation(subject),
         )
         .await;
@@ -68,11 +68,21 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
 }
 
 async fn observation(subject: &Subject<'_>) -> Result<Tested> {
-    let open = Open { image_height: 24, image_width: 40, ..subject.open() };
+    let (height, width) = (subject.side(24), subject.side(40));
+    let open = Open { image_height: height, image_width: width, ..subject.open() };
     let mut talk = subject.talk_with(&open).await?;
     let seen = talk.reset(0).await?;
-    let size = (seen.image.height, seen.image.width);
-    ensure!(size == (24, 40), "expected an image of 24 x 40, got {} x {}", size.0, size.1);
+    let (rows, columns) = (seen.image.height, seen.image.width);
+    ensure!(
+        (rows, columns) == (height as usize, width as usize),
+        "expected an image of {height} x {width}, got {rows} x {columns}"
+    );
+    ensure!(
+        seen.state.len() == subject.task().state.len(),
+        "expected a state of {} numbers, as described, got {}",
+        subject.task().state.len(),
+        seen.state.len()
+    );
     ensure!(seen.expert_action.is_none(), "expected no expert's action, got one");
     ensure!(
         seen.instruction == subject.task().instruction || subject.task().instruction.is_empty(),
@@ -101,7 +111,7 @@ async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
     let request = talk.resetting(Some(beyond), 0);
     names(&talk.refused(request).await?, &["configuration", &beyond.to_string()])?;
     // Refused: the world is unchanged, and the episode goes on.
-    talk.step(HOLD_STILL).await?;
+    talk.hold_still().await?;
     talk.close().await?;
     Ok(Tested::Kept)
 }
@@ -111,7 +121,7 @@ async fn trajectory(talk: &mut Talk, index: u64) -> Result<Vec<Reply>> {
     talk.reset(index).await?;
     let mut replies = vec![unnumbered(talk)?];
     for _ in 0..STEPS {
-        talk.step(MOVE).await?;
+        talk.go().await?;
         replies.push(unnumbered(talk)?);
     }
     Ok(replies)
@@ -173,12 +183,12 @@ async fn deterministic(subject: &Subject<'_>) -> Result<Tested> {
 
 async fn save(subject: &Subject<'_>) -> Result<Tested> {
     let mut talk = subject.episode(0).await?;
-    talk.step(MOVE).await?;
+    talk.go().await?;
     let saved = unnumbered(&talk)?;
     talk.save(2).await?;
     let mut first = Vec::new();
     for _ in 0..STEPS {
-        talk.step(MOVE).await?;
+        talk.go().await?;
         first.push(unnumbered(&talk)?);
     }
     let restored = talk.restore(2).await?;
@@ -187,7 +197,7 @@ async fn save(subject: &Subject<'_>) -> Result<Tested> {
     }
     let mut again = Vec::new();
     for _ in 0..STEPS {
-        talk.step(MOVE).await?;
+        talk.go().await?;
         again.push(unnumbered(&talk)?);
     }
     equal(&first, &again)?;
@@ -222,7 +232,7 @@ async fn horizon(subject: &Subject<'_>) -> Result<Tested> {
     }
     let mut talk = subject.episode(0).await?;
     for step in 1..=steps_max {
-        let transition = talk.step(HOLD_STILL).await?;
+        let transition = talk.hold_still().await?;
         ensure!(
             transition.truncated == (step == steps_max) || transition.terminated,
             "expected truncated at step {steps_max} alone, got {} at step {step}",
@@ -232,7 +242,7 @@ async fn horizon(subject: &Subject<'_>) -> Result<Tested> {
             break;
         }
     }
-    talk.refused(|sequence| Request::Step { sequence, action: HOLD_STILL }).await?;
+    talk.refused(|sequence| Request::Step { sequence, action: subject.still() }).await?;
     talk.reset(0).await?;
     talk.close().await?;
     Ok(Tested::Kept)

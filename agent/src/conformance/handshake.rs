@@ -35,7 +35,7 @@ async fn greetings(subject: &Subject<'_>, table: &mut Table<'_>) {
             let open = Open { protocol: PROTOCOL_VERSION + 1, ..subject.open() };
             let (expected, other) =
                 (format!("protocol {PROTOCOL_VERSION}"), (PROTOCOL_VERSION + 1).to_string());
-            names(&refusal(subject, unchecked(&open)).await?, &[&expected, &other])?;
+            names(&refusal(subject, unchecked(&open)).await?, &[expected, other])?;
             Ok(Tested::Kept)
         })
         .await;

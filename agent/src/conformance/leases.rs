@@ -6,7 +6,7 @@ use anyhow::{Result, bail, ensure};
 use protocol::{Reply, Request, decode};
 use tokio::time::Instant;
 
-use super::subject::{HOLD_STILL, Subject};
+use super::subject::Subject;
 use super::{Table, Tested};
 use crate::wire::Probe;
 
@@ -27,7 +27,8 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
                 talk.close().await?;
                 let again = talk.answer_to(&talk.request.clone()).await?;
                 ensure!(again == talk.reply, "expected the same bytes for the same Close");
-                talk.refused(|sequence| Request::Step { sequence, action: HOLD_STILL }).await?;
+                talk.refused(|sequence| Request::Step { sequence, action: subject.still() })
+                    .await?;
                 Ok(Tested::Kept)
             },
         )

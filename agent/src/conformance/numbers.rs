@@ -3,7 +3,7 @@
 use anyhow::{Result, ensure};
 use protocol::{Reply, Request, decode, encode, limits};
 
-use super::subject::{HOLD_STILL, MOVE, SILENCE, Subject, Talk, names, unchecked};
+use super::subject::{SILENCE, Subject, Talk, names, unchecked};
 use super::{Table, Tested};
 
 pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
@@ -18,10 +18,10 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
         .row("older", "a request with a lower number than the last is dropped", async {
             let mut talk = subject.episode(0).await?;
             let first = talk.request.clone();
-            talk.step(HOLD_STILL).await?;
+            talk.hold_still().await?;
             talk.probe.send(&first).await?;
             silent(&mut talk).await?;
-            talk.step(HOLD_STILL).await?;
+            talk.hold_still().await?;
             talk.close().await?;
             Ok(Tested::Kept)
         })
@@ -30,10 +30,10 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
         .row("gap", "a number too many is refused and not used up", async {
             let mut talk = subject.episode(0).await?;
             let gap = talk.sequence + 2;
-            let bytes = encode(&Request::Step { sequence: gap, action: MOVE })?;
+            let bytes = encode(&Request::Step { sequence: gap, action: subject.moving() })?;
             talk.refusal_of(&bytes, gap).await?;
             let expected = clean_step(subject, 0).await?;
-            talk.step(HOLD_STILL).await?;
+            talk.hold_still().await?;
             ensure!(talk.reply == expected, "expected the reply of a session without the gap");
             talk.close().await?;
             Ok(Tested::Kept)
@@ -75,15 +75,36 @@ async fn refusals(subject: &Subject<'_>, table: &mut Table<'_>) {
         .row("values", "an action with NaN or infinity is refused; its number is used up", async {
             let mut talk = subject.episode(0).await?;
             for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-                let mut action = HOLD_STILL;
-                action[3] = bad;
-                let sequence = talk.sequence + 1;
-                let bytes = unchecked(&Request::Step { sequence, action });
-                names(&talk.refusal_of(&bytes, sequence).await?, &["action", "index 3"])?;
-                talk.sequence = sequence;
+                let mut action = subject.still();
+                let last = action.len() - 1;
+                action[last] = bad;
+                let words = ["action".to_owned(), format!("index {last}")];
+                wrong_action(&mut talk, action, &words).await?;
             }
             unchanged(subject, talk).await
         })
+        .await;
+    table
+        .row(
+            "dimensions",
+            "an action of another length than described is refused; its number is used up",
+            async {
+                let mut talk = subject.episode(0).await?;
+                let described = subject.still().len();
+                for length in [0, described - 1, described + 1, limits::ACTION_DIMENSIONS_MAX + 1] {
+                    let words = ["action".to_owned(), length.to_string()];
+                    wrong_action(&mut talk, vec![0.0; length], &words).await?;
+                }
+                unchanged(subject, talk).await
+            },
+        )
+        .await;
+    table
+        .row(
+            "discrete",
+            "a discrete number that is not whole or out of bounds is refused; its number is used up",
+            discrete(subject),
+        )
         .await;
     table
         .row("slots", "a slot from 16 on is refused, and so is an empty one", async {
@@ -101,10 +122,35 @@ async fn refusals(subject: &Subject<'_>, table: &mut Table<'_>) {
         .await;
 }
 
+/// Sends a step whose action must be refused for a reason with these words.
+async fn wrong_action(talk: &mut Talk, action: Vec<f32>, words: &[String]) -> Result<()> {
+    let sequence = talk.sequence + 1;
+    let bytes = unchecked(&Request::Step { sequence, action });
+    names(&talk.refusal_of(&bytes, sequence).await?, words)?;
+    talk.sequence = sequence;
+    Ok(())
+}
+
+async fn discrete(subject: &Subject<'_>) -> Result<Tested> {
+    let dimensions = &subject.task().action;
+    let Some(index) = dimensions.iter().position(|dimension| dimension.discrete) else {
+        return Ok(Tested::NotTested("none of its actions' numbers is discrete".to_owned()));
+    };
+    let mut talk = subject.episode(0).await?;
+    let (low, high) = (dimensions[index].low, dimensions[index].high);
+    let (low, high) = (low.unwrap_or_default(), high.unwrap_or_default());
+    for bad in [low + 0.5, high + 1.0, low - 1.0] {
+        let mut action = subject.still();
+        action[index] = bad;
+        wrong_action(&mut talk, action, &["action".to_owned(), bad.to_string()]).await?;
+    }
+    unchanged(subject, talk).await
+}
+
 async fn repeated(subject: &Subject<'_>) -> Result<Tested> {
     let mut talk = subject.episode(0).await?;
     for _ in 0..2 {
-        talk.step(MOVE).await?;
+        talk.go().await?;
         for _ in 0..2 {
             let again = talk.answer_to(&talk.request.clone()).await?;
             ensure!(again == talk.reply, "expected the same bytes again, got others");
@@ -113,8 +159,8 @@ async fn repeated(subject: &Subject<'_>) -> Result<Tested> {
     let twice = talk.reply.clone();
     talk.close().await?;
     let mut clean = subject.episode(0).await?;
-    clean.step(MOVE).await?;
-    clean.step(MOVE).await?;
+    clean.go().await?;
+    clean.go().await?;
     ensure!(clean.reply == twice, "expected what a session without repetitions gives");
     clean.close().await?;
     Ok(Tested::Kept)
@@ -122,7 +168,7 @@ async fn repeated(subject: &Subject<'_>) -> Result<Tested> {
 
 /// What was refused has left the world as it was, and the session goes on.
 async fn unchanged(subject: &Subject<'_>, mut talk: Talk) -> Result<Tested> {
-    talk.step(HOLD_STILL).await?;
+    talk.hold_still().await?;
     let (Reply::Stepped { transition: got, .. }, Reply::Stepped { transition: expected, .. }) =
         (decode(&talk.reply)?, decode(&clean_step(subject, 0).await?)?)
     else {
@@ -136,7 +182,7 @@ async fn unchanged(subject: &Subject<'_>, mut talk: Talk) -> Result<Tested> {
 /// The reply to the first step of an undisturbed episode.
 async fn clean_step(subject: &Subject<'_>, index: u64) -> Result<Vec<u8>> {
     let mut talk = subject.episode(index).await?;
-    talk.step(HOLD_STILL).await?;
+    talk.hold_still().await?;
     let reply = talk.reply.clone();
     talk.close().await?;
     Ok(reply)

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use protocol::{
-    Description, Observation, Open, PROTOCOL_VERSION, Reply, Request, TaskDescription, Transition,
-    decode, encode,
+    Description, Dimension, Observation, Open, PROTOCOL_VERSION, Reply, Request, TaskDescription,
+    Transition, decode, encode,
 };
 
 use serde::Serialize;
@@ -23,10 +23,8 @@ const SETTLE_WAIT_MAX: Duration = Duration::from_secs(3);
 const SETTLE_LOOK: Duration = Duration::from_millis(50);
 /// Of the images that are asked for: small, so that the tests are quick.
 const SIDE: u32 = 32;
-/// Nothing moves, and the gripper stays open.
-pub const HOLD_STILL: [f32; 7] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
-/// Something moves.
-pub const MOVE: [f32; 7] = [0.01, 0.005, -0.01, 0.0, 0.0, 0.05, -1.0];
+/// How far a dimension is moved, as a share of its range; without bounds, in its own unit.
+const SHARE: f32 = 0.02;
 
 /// The server under test.
 pub struct Subject<'a> {
@@ -38,6 +36,8 @@ pub struct Subject<'a> {
 pub struct Talk {
     pub probe: Probe,
     task: TaskDescription,
+    still: Vec<f32>,
+    moving: Vec<f32>,
     /// Of the last request.
     pub sequence: u64,
     /// The last request as it was sent, and its reply as it came.
@@ -73,13 +73,36 @@ impl<'a> Subject<'a> {
         &self.description.tasks[0]
     }
 
+    /// An image's side as the server allows it, which may have no images.
+    pub fn side(&self, wanted: u32) -> u32 {
+        wanted.min(self.description.image_side_max)
+    }
+
+    /// An action that does little.
+    pub fn still(&self) -> Vec<f32> {
+        self.task().action.iter().map(rest).collect()
+    }
+
+    /// An action that does something.
+    pub fn moving(&self) -> Vec<f32> {
+        let moved = |dimension: &Dimension| {
+            let rest = rest(dimension);
+            match (dimension.low, dimension.high) {
+                (_, Some(high)) if dimension.discrete => high,
+                (Some(low), Some(high)) => (rest + SHARE * (high - low)).min(high),
+                (_, high) => (rest + SHARE).min(high.unwrap_or(f32::MAX)),
+            }
+        };
+        self.task().action.iter().map(moved).collect()
+    }
+
     pub fn open(&self) -> Open {
         Open {
             protocol: PROTOCOL_VERSION,
             task: self.task().task.clone(),
             variant: self.task().variant.clone(),
-            image_height: SIDE,
-            image_width: SIDE,
+            image_height: self.side(SIDE),
+            image_width: self.side(SIDE),
             expert: false,
             holder: "conformance".to_owned(),
         }
@@ -96,6 +119,8 @@ impl<'a> Subject<'a> {
         Ok(Talk {
             probe,
             task: self.task().clone(),
+            still: self.still(),
+            moving: self.moving(),
             sequence: 0,
             request: Vec::new(),
             reply: Vec::new(),
@@ -176,7 +201,17 @@ impl Talk {
         move |sequence| Request::Reset { sequence, task, variant, configuration, seed }
     }
 
-    pub async fn step(&mut self, action: [f32; 7]) -> Result<Transition> {
+    /// Steps with an action that does little.
+    pub async fn hold_still(&mut self) -> Result<Transition> {
+        self.step(self.still.clone()).await
+    }
+
+    /// Steps with an action that does something.
+    pub async fn go(&mut self) -> Result<Transition> {
+        self.step(self.moving.clone()).await
+    }
+
+    async fn step(&mut self, action: Vec<f32>) -> Result<Transition> {
         match self.ask(|sequence| Request::Step { sequence, action }).await? {
             Reply::Stepped { transition, .. } => Ok(transition),
             other => bail!("expected Stepped, got {}: {}", other.kind(), words(&other)),
@@ -205,6 +240,11 @@ impl Talk {
     }
 }
 
+/// Zero, or the nearest to it that the dimension has.
+fn rest(dimension: &Dimension) -> f32 {
+    0.0f32.max(dimension.low.unwrap_or(f32::MIN)).min(dimension.high.unwrap_or(f32::MAX))
+}
+
 fn words(reply: &Reply) -> &str {
     match reply {
         Reply::Refused { reason, .. } | Reply::Faulted { reason, .. } => reason,
@@ -218,8 +258,8 @@ pub fn unchecked(message: &impl Serialize) -> Vec<u8> {
 }
 
 /// Fails unless a reason names what it is about.
-pub fn names(reason: &str, parts: &[&str]) -> Result<()> {
-    for part in parts {
+pub fn names(reason: &str, parts: &[impl AsRef<str>]) -> Result<()> {
+    for part in parts.iter().map(AsRef::as_ref) {
         ensure!(reason.contains(part), "expected a reason that names {part:?}, got {reason:?}");
     }
     Ok(())

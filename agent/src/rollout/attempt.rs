@@ -101,7 +101,7 @@ impl Attempt {
 
     /// The verifier's logits of the candidates; once per step, for what they say is remembered.
     pub fn score(&mut self, proposal: &Proposal, policy: &Policy) -> Option<Vec<f32>> {
-        let [x, y, ..] = self.episode.observation().state;
+        let [x, y, ..] = self.episode.state();
         self.scene.gripper = [x, y];
         let verifier = self.verifier.as_ref()?;
         Some(score(verifier, proposal, policy, &mut self.scene))
@@ -116,10 +116,11 @@ impl Attempt {
         keep: Keep,
     ) -> [f32; 7] {
         let candidates: Vec<_> = proposal.candidates.iter().map(candidate_action).collect();
+        let expert_action = self.episode.expert_action();
         let decision = Decision {
             candidates: &candidates,
             logits: logits.as_deref(),
-            expert_action: self.episode.observation().expert_action.as_ref(),
+            expert_action: expert_action.as_ref(),
             action_scale,
         };
         let chosen = self.job.arm.strategy.choose(&decision);
@@ -132,7 +133,7 @@ impl Attempt {
             candidate_record(candidate, logits.as_ref().map(|logits| logits[index]), keep_hidden)
         });
         self.steps.push(StepRecord {
-            state: self.episode.observation().state,
+            state: self.episode.state(),
             candidates: records.collect(),
             chosen: chosen.map(|index| index as u32),
             statistics: protocol::Statistics::default(),

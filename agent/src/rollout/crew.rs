@@ -9,7 +9,9 @@ use protocol::{Open, PROTOCOL_VERSION};
 use super::attempt::Seat;
 use super::queue::Job;
 use crate::servers::LocalServers;
-use crate::wire::{Environment, EnvironmentFault, Network, ServerDescription};
+use crate::wire::{
+    ACTION_LENGTH, Environment, EnvironmentFault, Network, STATE_LENGTH, ServerDescription,
+};
 
 /// A run with nothing left to do but wait for a server gives up after this long.
 const SERVER_WAIT: Duration = Duration::from_secs(60);
@@ -171,10 +173,15 @@ impl<'a> Crew<'a> {
         job: &Job,
         has_expert: bool,
     ) -> Result<(Seat, Environment), Vec<String>> {
-        let mut servers: Vec<(String, String)> =
-            self.servers.iter().map(|server| (server.server.clone(), simulator(server))).collect();
-        servers.sort_by_key(|(server, _)| self.in_use.get(server).copied().unwrap_or(0));
         let mut refusals = Vec::new();
+        let mut servers: Vec<(String, String)> = Vec::new();
+        for server in &self.servers {
+            match unfit(server, job) {
+                Some(reason) => refusals.push(reason),
+                None => servers.push((server.server.clone(), simulator(server))),
+            }
+        }
+        servers.sort_by_key(|(server, _)| self.in_use.get(server).copied().unwrap_or(0));
         for (server, simulator) in servers {
             let open = Open {
                 protocol: PROTOCOL_VERSION,
@@ -206,6 +213,20 @@ impl<'a> Crew<'a> {
         let count = self.in_use.entry(server.to_owned()).or_default();
         *count = if is_more { *count + 1 } else { count.saturating_sub(1) };
     }
+}
+
+/// Why policies, which are made for Bridge's states and actions, cannot act in a server's task.
+fn unfit(server: &ServerDescription, job: &Job) -> Option<String> {
+    let (task, variant) = (&job.identity.task, &job.identity.variant);
+    let offered = server.tasks.iter().find(|one| one.task == *task && one.variant == *variant)?;
+    let got = (offered.state.len(), offered.action.len());
+    (got != (STATE_LENGTH, ACTION_LENGTH)).then(|| {
+        format!(
+            "server {}: task {task}: expected a state of {STATE_LENGTH} and an action of \
+             {ACTION_LENGTH} numbers, as the policy has, got {} and {}",
+            server.server, got.0, got.1
+        )
+    })
 }
 
 fn simulator(server: &ServerDescription) -> String {

@@ -238,7 +238,9 @@ impl Supervisor {
         let (parent, sessions) = (std::process::id(), self.options.sessions_each);
         let mut command: Command = self.program.command();
         command
-            .args(["serve", "--exit-with-parent", &parent.to_string()])
+            .arg("serve")
+            .args(self.program.serve_arguments())
+            .args(["--exit-with-parent", &parent.to_string()])
             .args(["--sessions", &sessions.to_string()])
             .args(["--connect", &self.options.connect, "--fleet", &self.options.fleet]);
         if let Some(seconds) = self.options.idle_secs {

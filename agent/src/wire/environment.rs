@@ -106,10 +106,7 @@ impl Environment {
         let Reset { task, variant, configuration, seed } = reset;
         let request = |sequence| Request::Reset { sequence, task, variant, configuration, seed };
         match self.ask("Reset", request).await? {
-            Reply::Observed { observation, .. } => {
-                self.check_image(&observation.image)?;
-                Ok(Episode::new(self, observation))
-            }
+            Reply::Observed { observation, .. } => Episode::new(self, observation),
             other => Err(unexpected("Observed", &other)),
         }
     }

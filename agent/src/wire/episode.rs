@@ -1,26 +1,49 @@
 //! A running episode: only what a reset returned can step.
 
-use protocol::limits::ACTION_LENGTH;
 use protocol::{Observation, Reply, Request, Transition};
 
 use super::environment::unexpected;
 use super::{Environment, EnvironmentFault};
+
+/// Numbers of a Bridge state: x y z (m) roll pitch yaw (rad) in the base's frame, pad, gripper opening.
+pub const STATE_LENGTH: usize = 8;
+/// Numbers of a Bridge action: translation (m), rotation vector (rad), gripper +1 open or -1 closed.
+pub const ACTION_LENGTH: usize = 7;
 
 /// Owns its environment until [`Episode::finish`]. After any fault but `Refused` it is void: drop it.
 #[derive(Debug)]
 pub struct Episode {
     environment: Environment,
     observation: Observation,
+    state: [f32; STATE_LENGTH],
+    expert_action: Option<[f32; ACTION_LENGTH]>,
 }
 
 impl Episode {
-    pub(super) fn new(environment: Environment, observation: Observation) -> Self {
-        Self { environment, observation }
+    pub(super) fn new(
+        environment: Environment,
+        observation: Observation,
+    ) -> Result<Self, EnvironmentFault> {
+        let (state, expert_action) = ([0.0; STATE_LENGTH], None);
+        let mut episode =
+            Self { environment, observation: observation.clone(), state, expert_action };
+        episode.observe(observation)?;
+        Ok(episode)
     }
 
     /// What the policy sees now.
     pub fn observation(&self) -> &Observation {
         &self.observation
+    }
+
+    /// Its state.
+    pub fn state(&self) -> [f32; STATE_LENGTH] {
+        self.state
+    }
+
+    /// The scripted expert's action here, where the session was opened for it.
+    pub fn expert_action(&self) -> Option<[f32; ACTION_LENGTH]> {
+        self.expert_action
     }
 
     /// The server's id.
@@ -33,7 +56,8 @@ impl Episode {
         &mut self,
         action: [f32; ACTION_LENGTH],
     ) -> Result<Transition, EnvironmentFault> {
-        match self.environment.ask("Step", |sequence| Request::Step { sequence, action }).await? {
+        let request = |sequence| Request::Step { sequence, action: action.to_vec() };
+        match self.environment.ask("Step", request).await? {
             Reply::Stepped { transition, .. } => {
                 self.observe(transition.observation.clone())?;
                 Ok(transition)
@@ -74,7 +98,18 @@ impl Episode {
 
     fn observe(&mut self, observation: Observation) -> Result<(), EnvironmentFault> {
         self.environment.check_image(&observation.image)?;
+        self.state = numbers("a state", &observation.state)?;
+        let expert_action = observation.expert_action.as_deref();
+        self.expert_action =
+            expert_action.map(|action| numbers("an expert's action", action)).transpose()?;
         self.observation = observation;
         Ok(())
     }
+}
+
+/// Policies and verifiers are made for Bridge's states and actions.
+fn numbers<const N: usize>(what: &str, values: &[f32]) -> Result<[f32; N], EnvironmentFault> {
+    values.try_into().map_err(|_| {
+        EnvironmentFault::wire(format!("expected {what} of {N} numbers, got {}", values.len()))
+    })
 }

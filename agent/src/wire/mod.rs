@@ -14,7 +14,7 @@ mod servers;
 mod verifier_updates;
 
 pub use environment::Environment;
-pub use episode::Episode;
+pub use episode::{ACTION_LENGTH, Episode, STATE_LENGTH};
 pub use fault::EnvironmentFault;
 pub use network::{Network, NetworkOptions, Timing};
 pub use outcomes::{OutcomePublisher, OutcomeSubscriber};

@@ -7,7 +7,7 @@ the repository; the Rust crate `protocol` is the specification.
 
 from rever_env.protocol import limits
 from rever_env.protocol.codec import Codec, CodecError, Invalid, Malformed, TooLarge
-from rever_env.protocol.description import Description, TaskDescription
+from rever_env.protocol.description import Description, Dimension, TaskDescription
 from rever_env.protocol.heartbeat import Heartbeat
 from rever_env.protocol.keys import PROTOCOL_VERSION, Keys
 from rever_env.protocol.observation import Image, Observation
@@ -45,6 +45,7 @@ __all__ = [
     "Codec",
     "CodecError",
     "Description",
+    "Dimension",
     "EpisodeOutcome",
     "FaultKind",
     "Faulted",

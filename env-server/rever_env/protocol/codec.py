@@ -1,8 +1,8 @@
 """Messages to bytes and back, strictly: a body is read only when every byte of it is meant.
 
 A message is a frozen dataclass with a method validate; its annotations say how fields lie on the
-wire. int: unsigned, 64 bits unless annotated; float: 32 bits; tuples of floats: exactly as long as
-annotated. The order of a map's entries is free when reading and the dataclass's when writing.
+wire. int: unsigned, 64 bits unless annotated; float: 32 bits. The order of a map's entries is free
+when reading and the dataclass's when writing.
 """
 
 import dataclasses
@@ -43,13 +43,6 @@ class Invalid(CodecError):
 @dataclasses.dataclass(frozen=True)
 class Bits:
     """Annotation of an int: how wide it may be."""
-
-    count: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Length:
-    """Annotation of a tuple of floats: how many there are."""
 
     count: int
 
@@ -192,8 +185,7 @@ def _field(hint: Any) -> tuple[Reader, Writer]:
             lambda value: None if value is None else writer(value),
         )
     if origin is tuple and typing.get_args(hint)[0] is float:
-        (length,) = (part.count for part in annotations if isinstance(part, Length))
-        return _floats(length), list
+        return _floats, list
     if origin is tuple:
         return _tuple(*_field(typing.get_args(hint)[0]))
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
@@ -219,20 +211,13 @@ def _integer(bits: int) -> Reader:
     return read
 
 
-def _floats(length: int) -> Reader:
-    expected = f"expected an array of {length} f32"
-
-    def read(value: object) -> tuple[float, ...]:
-        if type(value) is not list:
-            raise ValueError(f"invalid type: {_kind(value)}, {expected}")
-        if len(value) != length:
-            raise ValueError(f"invalid length {len(value)}, {expected}")
-        for element in value:
-            if type(element) is not float:
-                raise ValueError(f"invalid type: {_kind(element)}, expected f32")
-        return tuple(value)
-
-    return read
+def _floats(value: object) -> tuple[float, ...]:
+    if type(value) is not list:
+        raise ValueError(f"invalid type: {_kind(value)}, expected a sequence")
+    for element in value:
+        if type(element) is not float:
+            raise ValueError(f"invalid type: {_kind(element)}, expected f32")
+    return tuple(value)
 
 
 def _tuple(reader: Reader, writer: Writer) -> tuple[Reader, Writer]:

@@ -7,6 +7,30 @@ from rever_env.protocol.value import U32
 
 
 @dataclass(frozen=True)
+class Dimension:
+    """One number of a state or of an action, with its bounds where it has some.
+
+    discrete: only the whole numbers from low to high count.
+    """
+
+    name: str
+    low: float | None
+    high: float | None
+    discrete: bool
+
+    def validate(self) -> None:
+        value.name("dimension", self.name)
+        field = f"dimension {self.name}"
+        bounds = tuple(bound for bound in (self.low, self.high) if bound is not None)
+        value.finite(field, bounds)
+        is_whole = len(bounds) == 2 and all(bound.is_integer() for bound in bounds)
+        if self.discrete and not is_whole:
+            raise ValueError(f"{field}: expected whole bounds, for it is discrete")
+        if len(bounds) == 2 and bounds[0] > bounds[1]:
+            raise ValueError(f"{field}: expected low <= high, got {bounds[0]:g} and {bounds[1]:g}")
+
+
+@dataclass(frozen=True)
 class TaskDescription:
     """One task in one variant. configurations: how many fixed ones there are."""
 
@@ -16,6 +40,8 @@ class TaskDescription:
     instruction: str
     steps_max: U32
     configurations: U32
+    state: tuple[Dimension, ...]
+    action: tuple[Dimension, ...]
 
 
 @dataclass(frozen=True)
@@ -27,8 +53,6 @@ class Description:
     simulator: str
     simulator_version: str
     tasks: tuple[TaskDescription, ...]
-    state: tuple[str, ...]
-    action: tuple[str, ...]
     image_side_max: U32
     sessions: U32
     sessions_max: U32
@@ -46,11 +70,11 @@ class Description:
             value.name("variant", task.variant)
             value.text("instruction", task.instruction)
             value.range("steps_max", task.steps_max, 1, 1_000_000)
-        value.range("state", len(self.state), limits.STATE_LENGTH, limits.STATE_LENGTH)
-        value.range("action", len(self.action), limits.ACTION_LENGTH, limits.ACTION_LENGTH)
-        for name in self.state + self.action:
-            value.name("value name", name)
-        value.range("image_side_max", self.image_side_max, 1, limits.IMAGE_SIDE_MAX)
+            value.length("state", task.state, 0, limits.STATE_DIMENSIONS_MAX)
+            value.length("action", task.action, 1, limits.ACTION_DIMENSIONS_MAX)
+            for dimension in task.state + task.action:
+                dimension.validate()
+        value.range("image_side_max", self.image_side_max, 0, limits.IMAGE_SIDE_MAX)
         value.range("sessions_max", self.sessions_max, 1, limits.SESSIONS_MAX)
         value.range("sessions", self.sessions, 0, self.sessions_max)
         value.range("slots_max", self.slots_max, 0, limits.SLOTS_MAX)

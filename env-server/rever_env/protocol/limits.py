@@ -18,5 +18,5 @@ ELEMENTS_MAX = 4096  # of an array or a map
 SLOTS_MAX = 16  # save slots of a session, numbered from 0
 SESSIONS_MAX = 256  # of one server process
 SEED_END = 1 << 53  # first seed that is too large: seeds fit a double
-ACTION_LENGTH = 7
-STATE_LENGTH = 8
+ACTION_DIMENSIONS_MAX = 128
+STATE_DIMENSIONS_MAX = ELEMENTS_MAX

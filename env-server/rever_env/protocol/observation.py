@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from rever_env.protocol import value
-from rever_env.protocol.value import Action, State
+from rever_env.protocol import limits, value
 
 
 @dataclass(frozen=True)
@@ -17,12 +16,15 @@ class Image:
 
 @dataclass(frozen=True)
 class Observation:
-    """Everything that a policy may know, and on request the expert's opinion."""
+    """Everything that a policy may know, and on request the expert's opinion.
+
+    state, expert_action: as the task's description says.
+    """
 
     image: Image
-    state: State
+    state: tuple[float, ...]
     instruction: str
-    expert_action: Action | None
+    expert_action: tuple[float, ...] | None
 
     def validate(self) -> None:
         image = self.image
@@ -34,7 +36,9 @@ class Observation:
                 f"image: expected {expected} bytes for {image.height} x {image.width} pixels, "
                 f"got {len(image.pixels)}"
             )
+        value.length("state", self.state, 0, limits.STATE_DIMENSIONS_MAX)
         value.finite("state", self.state)
         value.text("instruction", self.instruction)
         if self.expert_action is not None:
+            value.length("expert_action", self.expert_action, 1, limits.ACTION_DIMENSIONS_MAX)
             value.finite("expert_action", self.expert_action)

@@ -7,7 +7,7 @@ refused.
 from dataclasses import dataclass
 
 from rever_env.protocol import limits, value
-from rever_env.protocol.value import U32, Action, Numbered
+from rever_env.protocol.value import U32, Numbered
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,14 @@ class Reset(Numbered):
 
 @dataclass(frozen=True)
 class Step(Numbered):
-    """One control step: metres, rotation vector in radians, gripper +1 open or -1 closed."""
+    """One control step. In a Bridge task: metres, rotation vector (rad), gripper +1 open."""
 
     sequence: int
-    action: Action
+    action: tuple[float, ...]
 
     def validate(self) -> None:
         super().validate()
+        value.length("action", self.action, 1, limits.ACTION_DIMENSIONS_MAX)
         value.finite("action", self.action)
 
 

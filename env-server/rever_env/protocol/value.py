@@ -1,15 +1,14 @@
 """Types and checks of single values, worded once for every message."""
 
 import math
+from collections.abc import Sized
 from typing import Annotated
 
 from rever_env.protocol import limits
-from rever_env.protocol.codec import Bits, Length
+from rever_env.protocol.codec import Bits
 from rever_env.protocol.keys import PROTOCOL_VERSION
 
 U32 = Annotated[int, Bits(32)]
-Action = Annotated[tuple[float, ...], Length(limits.ACTION_LENGTH)]
-State = Annotated[tuple[float, ...], Length(limits.STATE_LENGTH)]
 
 
 class Numbered:
@@ -40,6 +39,12 @@ def elements(field: str, length: int) -> None:
     """A list that a peer may loop over."""
     if length > limits.ELEMENTS_MAX:
         raise ValueError(f"{field}: expected at most {limits.ELEMENTS_MAX} elements, got {length}")
+
+
+def length(field: str, values: Sized, low: int, high: int) -> None:
+    """A list of so many numbers."""
+    if not low <= len(values) <= high:
+        raise ValueError(f"{field}: expected {low} to {high} numbers, got {len(values)}")
 
 
 def finite(field: str, values: tuple[float, ...]) -> None:

@@ -23,9 +23,6 @@ use zenoh::{Session as Network, Wait};
 use crate::session::{Session, refused};
 use crate::worlds::Worlds;
 
-const STATE_NAMES: [&str; 8] = ["x", "y", "z", "roll", "pitch", "yaw", "pad", "gripper"];
-const ACTION_NAMES: [&str; 7] =
-    ["x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "gripper"];
 const BEAT: Duration = Duration::from_millis(500);
 /// From opening a session to its holder's token.
 const HOLDER_WAIT_MAX: Duration = Duration::from_secs(10);
@@ -198,6 +195,8 @@ impl<'a> Server<'a> {
             instruction: task.rule.instruction.clone(),
             steps_max: task.rule.steps_max,
             configurations: task.rule.grid.configurations.len() as u32,
+            state: task.state.clone(),
+            action: task.action.clone(),
         });
         Description {
             protocol: PROTOCOL_VERSION,
@@ -209,8 +208,6 @@ impl<'a> Server<'a> {
                 mujoco_rs::mujoco_version()
             ),
             tasks: tasks.collect(),
-            state: STATE_NAMES.map(str::to_owned).to_vec(),
-            action: ACTION_NAMES.map(str::to_owned).to_vec(),
             image_side_max: limits::IMAGE_SIDE_MAX as u32,
             sessions: self.sessions(),
             sessions_max: self.options.sessions_max,

@@ -176,7 +176,7 @@ impl Session {
     /// An observation with the expert's action, for those who asked for it.
     fn seen(&self, observation: Observation) -> Result<Observation, Fault> {
         let expert_action = match &self.world {
-            Some((_, world)) if self.opened.expert => Some(world.expert_action()?),
+            Some((_, world)) if self.opened.expert => Some(world.expert_action()?.to_vec()),
             _ => None,
         };
         Ok(Observation { expert_action, ..observation })

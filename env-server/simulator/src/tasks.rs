@@ -4,8 +4,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
+use protocol::Dimension;
 use serde::Deserialize;
 use toml::Spanned;
+
+/// Numbers of an action: translation in metres, rotation vector in radians, gripper +1 open or -1 closed.
+pub const ACTION_LENGTH: usize = 7;
+/// Numbers of a state, in Bridge's order: x y z roll pitch yaw pad gripper.
+pub const STATE_LENGTH: usize = 8;
 
 /// Where source and target start: metres in the world frame, yaw in degrees.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -80,6 +86,8 @@ pub struct Task {
     pub name: String,
     pub scene: PathBuf,
     pub rule: TaskRule,
+    pub state: Vec<Dimension>,
+    pub action: Vec<Dimension>,
     pub settings: WorldSettings,
     pub inverse_kinematics: InverseKinematics,
     pub grasp: GraspRule,
@@ -132,10 +140,26 @@ pub struct Grid {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct File {
+    state: [Bounds; STATE_LENGTH],
+    action: [Bounds; ACTION_LENGTH],
     world: WorldSettings,
     inverse_kinematics: InverseKinematics,
     grasp: GraspRule,
     tasks: BTreeMap<String, Spanned<TaskRule>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Bounds {
+    name: String,
+    low: f32,
+    high: f32,
+}
+
+impl From<Bounds> for Dimension {
+    fn from(Bounds { name, low, high }: Bounds) -> Dimension {
+        Dimension { name, low: Some(low), high: Some(high), discrete: false }
+    }
 }
 
 impl From<[f64; 5]> for Placement {
@@ -151,7 +175,8 @@ pub fn load(assets: &Path) -> Result<Vec<Task>> {
         .with_context(|| format!("cannot read {}", path.display()))?;
     let file: File =
         toml::from_str(&text).with_context(|| format!("cannot read {}", path.display()))?;
-    let File { world, inverse_kinematics, grasp, tasks } = file;
+    let File { state, action, world, inverse_kinematics, grasp, tasks } = file;
+    let (state, action) = (state.map(Dimension::from), action.map(Dimension::from));
     let mut tasks: Vec<(String, Spanned<TaskRule>)> = tasks.into_iter().collect();
     tasks.sort_by_key(|(_, rule)| rule.span().start);
     let task = |(name, rule): (String, Spanned<TaskRule>)| {
@@ -160,6 +185,8 @@ pub fn load(assets: &Path) -> Result<Vec<Task>> {
             name,
             scene: assets.join(&rule.scene),
             rule,
+            state: state.to_vec(),
+            action: action.to_vec(),
             settings: world.clone(),
             inverse_kinematics: inverse_kinematics.clone(),
             grasp: grasp.clone(),

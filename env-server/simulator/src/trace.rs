@@ -5,12 +5,11 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
-use protocol::limits::ACTION_LENGTH;
 use protocol::{Observation, Statistics};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use crate::tasks::Task;
+use crate::tasks::{ACTION_LENGTH, Task};
 use crate::world::World;
 
 /// Print every number of an episode: one JSON object for the reset and one for each step

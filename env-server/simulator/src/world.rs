@@ -5,7 +5,6 @@ use std::sync::{Arc, Once};
 use mujoco_rs::mujoco_c::mju_user_warning;
 use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::fun::utility::*;
-use protocol::limits::{ACTION_LENGTH, STATE_LENGTH};
 use protocol::{Observation, Statistics, Transition};
 
 use crate::camera::Camera;
@@ -15,7 +14,7 @@ use crate::fault::Fault;
 use crate::model::{self, Names, Vector};
 use crate::placement::place;
 use crate::success::{Judge, Memory};
-use crate::tasks::{Placement, Task};
+use crate::tasks::{ACTION_LENGTH, Placement, STATE_LENGTH, Task};
 
 /// Objects start this far above rest, metres.
 const START_GAP: f64 = 0.002;
@@ -89,12 +88,16 @@ impl World {
     }
 
     /// One control step of 0.2 s. Success ends no episode: SIMPLER reads the last step.
-    pub fn step(&mut self, action: &[f32; ACTION_LENGTH]) -> Result<Transition, Fault> {
+    pub fn step(&mut self, action: &[f32]) -> Result<Transition, Fault> {
         let steps = self.running()?.steps;
         let steps_max = self.task.rule.steps_max;
         if steps >= steps_max {
             return Err(Fault::Wrong(format!("step {}: expected at most {steps_max}", steps + 1)));
         }
+        let action: [f32; ACTION_LENGTH] = action.try_into().map_err(|_| {
+            let (expected, got) = (ACTION_LENGTH, action.len());
+            Fault::Wrong(format!("action: expected shape ({expected},), got ({got},)"))
+        })?;
         let action = action.map(f64::from);
         let target = self.controller.joint_target(&self.data, &action);
         self.advance(&target, action[6])?;
@@ -285,7 +288,7 @@ impl World {
     fn observe(&mut self) -> Result<Observation, Fault> {
         Ok(Observation {
             image: self.camera.image(&mut self.data)?,
-            state: self.state(),
+            state: self.state().to_vec(),
             instruction: self.task.rule.instruction.clone(),
             expert_action: None,
         })

@@ -2,17 +2,34 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::value;
+use super::{single, value};
 use crate::codec::Message;
 use crate::limits::{
-    ACTION_LENGTH, DESCRIPTION_BYTES_MAX, IMAGE_SIDE_MAX, SESSIONS_MAX, SLOTS_MAX, STATE_LENGTH,
+    ACTION_DIMENSIONS_MAX, DESCRIPTION_BYTES_MAX, IMAGE_SIDE_MAX, SESSIONS_MAX, SLOTS_MAX,
+    STATE_DIMENSIONS_MAX,
 };
 
+/// One number of a state or of an action.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Dimension {
+    /// What it is, such as `x` or `gripper`.
+    pub name: String,
+    /// Lowest value, where there is one.
+    #[serde(deserialize_with = "single::maybe_one")]
+    pub low: Option<f32>,
+    /// Highest value, where there is one.
+    #[serde(deserialize_with = "single::maybe_one")]
+    pub high: Option<f32>,
+    /// Whether only the whole numbers from `low` to `high` count.
+    pub discrete: bool,
+}
+
 /// One task in one variant.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskDescription {
-    /// SIMPLER's name.
+    /// Its name; of the Bridge tasks, SIMPLER's.
     pub task: String,
     /// `default`, or what is changed.
     pub variant: String,
@@ -24,10 +41,14 @@ pub struct TaskDescription {
     pub steps_max: u32,
     /// Fixed configurations, numbered from 0; the random ones lie beside them.
     pub configurations: u32,
+    /// What the numbers of a state are.
+    pub state: Vec<Dimension>,
+    /// What the numbers of an action are.
+    pub action: Vec<Dimension>,
 }
 
 /// The answer to a query on `describe`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
     /// Version of the protocol that the server speaks.
@@ -40,11 +61,7 @@ pub struct Description {
     pub simulator_version: String,
     /// Every task in every variant.
     pub tasks: Vec<TaskDescription>,
-    /// Names of the state's values.
-    pub state: Vec<String>,
-    /// Names of the action's values.
-    pub action: Vec<String>,
-    /// Largest height and width of an image.
+    /// Largest height and width of an image; 0 where there are none.
     pub image_side_max: u32,
     /// Sessions in use.
     pub sessions: u32,
@@ -54,6 +71,27 @@ pub struct Description {
     pub slots_max: u32,
     /// Seconds without a request after which a session ends.
     pub idle_secs_max: u32,
+}
+
+impl Dimension {
+    fn validate(&self) -> Result<(), String> {
+        value::name("dimension", &self.name)?;
+        let bounds: Vec<f32> = self.low.into_iter().chain(self.high).collect();
+        value::finite(&format!("dimension {}", self.name), &bounds)?;
+        let is_whole = bounds.len() == 2 && bounds.iter().all(|bound| bound.fract() == 0.0);
+        if self.discrete && !is_whole {
+            return Err(format!(
+                "dimension {}: expected whole bounds, for it is discrete",
+                self.name
+            ));
+        }
+        match bounds[..] {
+            [low, high] if low > high => {
+                Err(format!("dimension {}: expected low <= high, got {low} and {high}", self.name))
+            }
+            _ => Ok(()),
+        }
+    }
 }
 
 impl Message for Description {
@@ -75,19 +113,11 @@ impl Message for Description {
             value::name("variant", &task.variant)?;
             value::text("instruction", &task.instruction)?;
             value::range("steps_max", task.steps_max.into(), 1, 1_000_000)?;
+            value::length("state", task.state.len(), 0, STATE_DIMENSIONS_MAX)?;
+            value::length("action", task.action.len(), 1, ACTION_DIMENSIONS_MAX)?;
+            task.state.iter().chain(&task.action).try_for_each(Dimension::validate)?;
         }
-        value::range("state", self.state.len() as u64, STATE_LENGTH as u64, STATE_LENGTH as u64)?;
-        value::range(
-            "action",
-            self.action.len() as u64,
-            ACTION_LENGTH as u64,
-            ACTION_LENGTH as u64,
-        )?;
-        self.state
-            .iter()
-            .chain(&self.action)
-            .try_for_each(|name| value::name("value name", name))?;
-        value::range("image_side_max", self.image_side_max.into(), 1, IMAGE_SIDE_MAX as u64)?;
+        value::range("image_side_max", self.image_side_max.into(), 0, IMAGE_SIDE_MAX as u64)?;
         value::range("sessions_max", self.sessions_max.into(), 1, SESSIONS_MAX.into())?;
         value::range("sessions", self.sessions.into(), 0, self.sessions_max.into())?;
         value::range("slots_max", self.slots_max.into(), 0, SLOTS_MAX.into())?;

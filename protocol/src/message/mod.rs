@@ -12,7 +12,7 @@ mod statistics;
 mod value;
 mod verifier_update;
 
-pub use description::{Description, TaskDescription};
+pub use description::{Description, Dimension, TaskDescription};
 pub use heartbeat::Heartbeat;
 pub use observation::{Image, Observation};
 pub use open::{Open, Opening};

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{single, value};
-use crate::limits::{ACTION_LENGTH, STATE_LENGTH};
+use crate::limits::{ACTION_DIMENSIONS_MAX, STATE_DIMENSIONS_MAX};
 
 /// A picture; 0 x 0 where none was asked for.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -24,14 +24,15 @@ pub struct Image {
 pub struct Observation {
     /// The camera's picture in the size that was asked for at `Open`.
     pub image: Image,
-    /// Bridge's order: x y z in metres, roll pitch yaw in radians, 0, gripper opening 0 to 1; base frame.
-    #[serde(deserialize_with = "single::array")]
-    pub state: [f32; STATE_LENGTH],
+    /// As the task's description says. Of a Bridge task: x y z in metres, roll pitch yaw in radians, 0, gripper
+    /// opening 0 to 1; base frame.
+    #[serde(deserialize_with = "single::list")]
+    pub state: Vec<f32>,
     /// What the robot is told to do.
     pub instruction: String,
     /// The scripted expert's action at this state; only in a session opened with `expert`.
-    #[serde(deserialize_with = "single::maybe_array")]
-    pub expert_action: Option<[f32; ACTION_LENGTH]>,
+    #[serde(deserialize_with = "single::maybe_list")]
+    pub expert_action: Option<Vec<f32>>,
 }
 
 impl Image {
@@ -54,8 +55,11 @@ impl Image {
 impl Observation {
     pub(crate) fn validate(&self) -> Result<(), String> {
         self.image.validate()?;
+        value::length("state", self.state.len(), 0, STATE_DIMENSIONS_MAX)?;
         value::finite("state", &self.state)?;
         value::text("instruction", &self.instruction)?;
-        self.expert_action.as_ref().map_or(Ok(()), |action| value::finite("expert_action", action))
+        let Some(action) = &self.expert_action else { return Ok(()) };
+        value::length("expert_action", action.len(), 1, ACTION_DIMENSIONS_MAX)?;
+        value::finite("expert_action", action)
     }
 }

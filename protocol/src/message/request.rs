@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{single, value};
 use crate::codec::Message;
-use crate::limits::{ACTION_LENGTH, REQUEST_BYTES_MAX, SEED_END, SLOTS_MAX};
+use crate::limits::{ACTION_DIMENSIONS_MAX, REQUEST_BYTES_MAX, SEED_END, SLOTS_MAX};
 
 /// Everything that decides an episode's start.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -42,9 +42,10 @@ pub enum Request {
     Step {
         /// This request's number.
         sequence: u64,
-        /// Translation in metres, rotation vector in radians, gripper +1 open or -1 closed; base frame.
-        #[serde(deserialize_with = "single::array")]
-        action: [f32; ACTION_LENGTH],
+        /// As the task's description says. In a Bridge task: translation in metres, rotation vector in radians,
+        /// gripper +1 open or -1 closed; base frame.
+        #[serde(deserialize_with = "single::list")]
+        action: Vec<f32>,
     },
     /// Keeps the state in a slot until the next `Reset`. Answered with `Saved`.
     Save {
@@ -92,7 +93,10 @@ impl Message for Request {
                 value::name("variant", variant)?;
                 value::range("seed", *seed, 0, SEED_END - 1)
             }
-            Request::Step { action, .. } => value::finite("action", action),
+            Request::Step { action, .. } => {
+                value::length("action", action.len(), 1, ACTION_DIMENSIONS_MAX)?;
+                value::finite("action", action)
+            }
             Request::Save { slot, .. } | Request::Restore { slot, .. } => {
                 value::range("slot", (*slot).into(), 0, u64::from(SLOTS_MAX) - 1)
             }

@@ -30,6 +30,14 @@ pub fn elements(field: &str, length: usize) -> Result<(), String> {
     Ok(())
 }
 
+/// A list of so many numbers.
+pub fn length(field: &str, length: usize, low: usize, high: usize) -> Result<(), String> {
+    if !(low..=high).contains(&length) {
+        return Err(format!("{field}: expected {low} to {high} numbers, got {length}"));
+    }
+    Ok(())
+}
+
 /// Numbers without NaN and infinity.
 pub fn finite(field: &str, values: &[f32]) -> Result<(), String> {
     match values.iter().position(|value| !value.is_finite()) {
@@ -49,7 +57,6 @@ pub fn range(field: &str, value: u64, low: u64, high: u64) -> Result<(), String>
     Ok(())
 }
 
-/// A request's number; 0 stands in a reply to a request that could not be read.
 /// Both sides are 0 when no image is wanted.
 pub fn image_sides(fields: [&str; 2], height: u64, width: u64) -> Result<(), String> {
     if (height, width) == (0, 0) {
@@ -59,6 +66,7 @@ pub fn image_sides(fields: [&str; 2], height: u64, width: u64) -> Result<(), Str
     range(fields[1], width, 1, limits::IMAGE_SIDE_MAX as u64)
 }
 
+/// A request's number; 0 stands in a reply to a request that could not be read.
 pub fn sequence(value: u64, low: u64) -> Result<(), String> {
     range("sequence", value, low, limits::SEED_END - 1)
 }

@@ -1,0 +1,212 @@
+"""The Bridge tasks as robosuite environments, with its controllers and our WidowX."""
+
+import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
+from robosuite.models.tasks import ManipulationTask
+
+from rever_env import expert, tasks
+from rever_env.placement import SEED_LIMIT, place
+from rever_env.protocol import Statistics
+from rever_env.robosuite_models import WidowX, bridge_arena
+from rever_env.success import Judge, Memory
+from rever_env.tasks import Placement, Task
+from rever_env.world import place_objects
+
+CAMERA = "robot0_third_person"
+# robosuite's names of the parts that the rules of a task speak of.
+_ROBOT_PREFIX, _GRIPPER_PREFIX = "robot0_", "gripper0_right_"
+# Metres and radians of a full command, per control step: the Bridge tasks' steps stay within.
+_MOVE_MAX, _TURN_MAX = 0.1, 0.8
+_CONTROLLER = {
+    "type": "BASIC",
+    "body_parts": {
+        "right": {
+            "type": "OSC_POSE",
+            "input_max": 1,
+            "input_min": -1,
+            "output_max": [_MOVE_MAX] * 3 + [_TURN_MAX] * 3,
+            "output_min": [-_MOVE_MAX] * 3 + [-_TURN_MAX] * 3,
+            "kp": 600,
+            "damping_ratio": 1,
+            "impedance_mode": "fixed",
+            "kp_limits": [0, 1000],
+            "damping_ratio_limits": [0, 10],
+            "position_limits": None,
+            "orientation_limits": None,
+            "uncouple_pos_ori": True,
+            "input_type": "delta",
+            "input_ref_frame": "base",
+            # A delta moves the goal, not the measured pose, as in SIMPLER.
+            "goal_update_mode": "desired",
+            "interpolation": None,
+            "ramp_ratio": 0.2,
+            "gripper": {"type": "GRIP"},
+        }
+    },
+}
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """A running episode as the expert sees it."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    task: Task
+    judge: Judge
+    memory: Memory
+
+    def running_memory(self) -> Memory:
+        return self.memory
+
+
+class BridgeTask(ManipulationEnv):  # type: ignore[misc]
+    """One Bridge task. begin(configuration, seed) is a reset to a placement that can be repeated;
+
+    reset() draws one from robosuite's own generator. reward: 1 when the task is solved, else 0.
+    """
+
+    task_name = ""
+
+    def __init__(
+        self, robots: Any = WidowX.__name__, controller_configs: Any = None, **arguments: Any
+    ):
+        self.task = _renamed(tasks.load()[self.task_name])
+        self._placement: Placement | None = None
+        self.memory: Memory | None = None
+        arguments.setdefault("control_freq", 5)
+        arguments.setdefault("camera_names", CAMERA)
+        arguments.setdefault("render_camera", CAMERA)
+        arguments.setdefault("initialization_noise", None)
+        arguments.setdefault("horizon", self.task.steps_max)
+        controller = copy.deepcopy(_CONTROLLER)
+        super().__init__(
+            robots=robots, controller_configs=controller_configs or controller, **arguments
+        )
+
+    def begin(self, configuration: int | None, seed: int) -> Any:
+        """The observation at the start of an episode; the same arguments give the same one."""
+        self._placement = place(self.task, configuration, seed)
+        try:
+            return self.reset()
+        finally:
+            self._placement = None
+
+    def reward(self, action: Any = None) -> float:
+        return float(self._check_success())
+
+    def judged(self) -> Statistics:
+        """The episode's statistics; once per control step, for they have a memory."""
+        assert self.memory is not None, "an episode has begun"
+        return self.judge.judge(self._data(), self.memory)
+
+    def expert_action(self) -> NDArray[np.float64]:
+        """The scripted expert's action here, float64 (7,) as in the Bridge tasks."""
+        assert self.memory is not None, "an episode has begun"
+        stage = _Stage(self.sim.model._model, self._data(), self.task, self.judge, self.memory)
+        return expert.decide(self.task, expert.look(stage)).action
+
+    def _data(self) -> mujoco.MjData:
+        """MuJoCo's own, for the rules of the task."""
+        return self.sim.data._data
+
+    def _check_success(self) -> bool:
+        assert self.memory is not None, "an episode has begun"
+        data = self._data()
+        return self.judge.on_target(data, self.memory, self.judge.touch(data))
+
+    def _load_model(self) -> None:
+        super()._load_model()
+        (robot,) = self.robots
+        robot.init_qpos = np.array(self.task.robot_joints[:6])
+        self.model = ManipulationTask(
+            mujoco_arena=bridge_arena(self.task),
+            mujoco_robots=[robot.robot_model],
+            mujoco_objects=[],
+        )
+        # The damping of the fingers' drives makes explicit Euler diverge.
+        self.model.root.find("option").set("integrator", "implicitfast")
+
+    def _setup_references(self) -> None:
+        super()._setup_references()
+        self.judge = Judge(self.sim.model._model, self.task)
+
+    def _reset_internal(self) -> None:
+        super()._reset_internal()
+        placement = self._placement
+        if placement is None:
+            placement = place(self.task, None, int(self.rng.integers(SEED_LIMIT)))
+        model, data = self.sim.model._model, self._data()
+        place_objects(model, data, self.task, placement)
+        self._settle(model, data)
+        self.memory = self.judge.begin(data)
+
+    def _settle(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Lets the objects come to rest while the robot, which nobody controls yet, is held."""
+        settings = self.task.settings
+        joints = [model.joint(name) for name in settings.arm_joints + settings.finger_joints]
+        positions = [joint.qposadr[0] for joint in joints]
+        speeds = [joint.dofadr[0] for joint in joints]
+        data.qpos[positions] = self.task.robot_joints
+        for _ in range(2):
+            for _ in range(round(settings.settle / settings.timestep)):
+                mujoco.mj_step(model, data)
+                data.qpos[positions] = self.task.robot_joints
+                data.qvel[speeds] = 0.0
+            data.qvel[:] = 0.0
+        self.sim.forward()
+
+
+class SpoonOnTowel(BridgeTask):
+    """Put the spoon on the towel."""
+
+    task_name = "widowx_spoon_on_towel"
+
+
+class CarrotOnPlate(BridgeTask):
+    """Put the carrot on the plate."""
+
+    task_name = "widowx_carrot_on_plate"
+
+
+class StackCube(BridgeTask):
+    """Stack the green cube on the yellow one."""
+
+    task_name = "widowx_stack_cube"
+
+
+class EggplantInBasket(BridgeTask):
+    """Put the eggplant into the basket."""
+
+    task_name = "widowx_put_eggplant_in_basket"
+
+
+ENVIRONMENTS = {
+    kind.task_name: kind.__name__
+    for kind in (SpoonOnTowel, CarrotOnPlate, StackCube, EggplantInBasket)
+}
+
+
+def _renamed(task: Task) -> Task:
+    """The task in robosuite's names."""
+    settings = task.settings
+
+    def of_gripper(names: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(_GRIPPER_PREFIX + name for name in names)
+
+    names = replace(
+        settings,
+        tcp=f"{_GRIPPER_PREFIX}grip_site",
+        camera=CAMERA,
+        arm_joints=tuple(_ROBOT_PREFIX + name for name in settings.arm_joints),
+        finger_joints=of_gripper(settings.finger_joints),
+        finger_bodies=of_gripper(settings.finger_bodies),
+        robot_body=_ROBOT_PREFIX + settings.robot_body,
+    )
+    return replace(task, settings=names)
