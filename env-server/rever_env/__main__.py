@@ -12,6 +12,7 @@ def main() -> int:
     """Parses, calls one library function, prints one error, returns the exit status."""
     # MuJoCo reads its OpenGL backend from the environment when it is first imported.
     os.environ.setdefault("MUJOCO_GL", "egl")
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # Gymnasium's own pictures need no screen
     arguments = _parser().parse_args()
     from rever_env.fault import Fault
 

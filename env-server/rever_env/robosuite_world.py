@@ -1,4 +1,4 @@
-"""robosuite's environments behind the protocol: any of its tasks, any of its one-armed robots."""
+"""robosuite's environments behind the protocol: any of its tasks with any of its robots."""
 
 import copy
 from collections.abc import Iterable, Mapping
@@ -51,6 +51,7 @@ class RobosuiteTask:
     version: int = 1
     configurations: tuple[Any, ...] = ()  # robosuite draws every placement of its own tasks
     is_bridge: bool = False
+    is_one_arm: bool = True
 
 
 def offered(
@@ -58,7 +59,8 @@ def offered(
 ) -> dict[str, RobosuiteTask]:
     """Every named task with every named robot; InvalidPlacement for an unknown name.
 
-    A Bridge task has its own robot, horizon and rate of control.
+    robots: ROBOT, or ROBOT+ROBOT for a task of two. A Bridge task has its own robot, horizon and
+    rate of control.
     """
     import robosuite
 
@@ -67,26 +69,69 @@ def offered(
     names, robots = [name for name in names if name not in own], list(robots)
     for kind, given, known in (
         ("task", names, {*robosuite.ALL_ENVIRONMENTS, *bridge}),
-        ("robot", robots, robosuite.ALL_ROBOTS),
+        ("robot", [one for some in robots for one in some.split("+")], robosuite.ALL_ROBOTS),
     ):
         unknown = sorted(set(given) - set(known))
         if unknown:
             raise InvalidPlacement(f"{kind}s {unknown}: expected some of {sorted(known)}")
-    # What a Bridge task has: RobosuiteWorld brings robosuite's own to it.
-    any_bridge = next(iter(bridge.values()))
     return own | {
-        f"{name}/{robot}": RobosuiteTask(
+        f"{name}/{robot}": _task(
             name,
             robot,
-            _INSTRUCTIONS.get(name, name),
             steps_max,
-            any_bridge.state,
-            any_bridge.action,
-            {"env_name": name, "robots": robot, "control_freq": control_hz},
+            {"env_name": name, "robots": robot.split("+"), "control_freq": control_hz},
         )
         for name in names
         for robot in robots
     }
+
+
+def _task(name: str, robot: str, steps_max: int, making: Mapping[str, Any]) -> RobosuiteTask:
+    """One arm with a gripper has what a Bridge task has; others, robosuite's own numbers."""
+    import robosuite
+
+    try:
+        environment = robosuite.make(
+            **making, has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False
+        )
+    except (AssertionError, ValueError) as error:
+        raise InvalidPlacement(f"task {name} with {robot}: {error}") from error
+    is_one_arm = len(environment.robots) == 1 and environment.action_dim == 7
+    if is_one_arm:
+        bridge = next(iter(tasks.load().values()))
+        state, action = bridge.state, bridge.action
+    else:
+        low, high = environment.action_spec
+        action = tuple(
+            Dimension(f"action[{index}]", float(bounds[0]), float(bounds[1]), False)
+            for index, bounds in enumerate(zip(low, high, strict=True))
+        )
+        state = tuple(
+            Dimension(f"{part}[{index}]", None, None, False)
+            for part, numbers in _felt(environment.reset())
+            for index in range(len(numbers))
+        )
+    environment.close()
+    return RobosuiteTask(
+        name,
+        robot,
+        _INSTRUCTIONS.get(name, name),
+        steps_max,
+        state,
+        action,
+        making,
+        is_one_arm=is_one_arm,
+    )
+
+
+def _felt(observation: Mapping[str, Any]) -> list[tuple[str, NDArray[np.float64]]]:
+    """What each robot feels of itself, by its name."""
+    ending = "_proprio-state"
+    return [
+        (name.removesuffix(ending), np.asarray(observation[name]))
+        for name in sorted(observation)
+        if name.endswith(ending)
+    ]
 
 
 def _bridge(task: tasks.Task) -> RobosuiteTask:
@@ -113,10 +158,12 @@ def simulator() -> str:
 
 
 class RobosuiteWorld:
-    """One robosuite environment with an operational-space controller (deltas in the base frame).
+    """One robosuite environment with its default controller.
 
-    Not thread-safe: use it in the thread that made it. Moves beyond the controller's limit per step
-    are cut, as robosuite does. Statistics of its own tasks know success alone.
+    Not thread-safe: use it in the thread that made it. One arm is driven like a Bridge task's, in
+    metres and radians in the base's frame; moves beyond the controller's limit per step are cut, as
+    robosuite does. Other robots take robosuite's own actions. Statistics of its own tasks know
+    success alone.
     """
 
     def __init__(self, task: RobosuiteTask, image_height: int, image_width: int) -> None:
@@ -141,16 +188,10 @@ class RobosuiteWorld:
             seed=0,
             **cameras,
         )
-        robots = self._environment.robots
-        if len(robots) != 1 or self._environment.action_dim != 7:
-            raise InvalidPlacement(
-                f"task {task.name} with {task.variant}: expected one arm and actions of 7 numbers, "
-                f"got {len(robots)} robots and {self._environment.action_dim} numbers"
-            )
-        self._robot = robots[0]
-        controllers = self._robot.part_controllers
-        self._arm = controllers[self._robot.arms[0]]
-        self._scale = np.asarray(self._arm.output_max, np.float64)
+        self._robot = self._environment.robots[0]
+        if task.is_one_arm:
+            arm = self._robot.part_controllers[self._robot.arms[0]]
+            self._scale = np.asarray(arm.output_max, np.float64)
         self._steps: int | None = None
         self._ever_success = False
         self._last: Observation | None = None
@@ -180,11 +221,16 @@ class RobosuiteWorld:
         if steps >= self.task.steps_max:
             raise InvalidAction(f"step {steps + 1}: expected at most {self.task.steps_max}")
         self._make_current()
-        if action.shape != (7,):
-            raise InvalidAction(f"action: expected shape (7,), got {action.shape}")
-        # robosuite's gripper closes at +1.
-        command = np.concatenate([action[:6] / self._scale, [-action[6]]])
-        observation, reward, _, _ = self._environment.step(np.clip(command, -1.0, 1.0))
+        count = len(self.task.action)
+        if action.shape != (count,):
+            raise InvalidAction(f"action: expected shape ({count},), got {action.shape}")
+        if self.task.is_one_arm:
+            # robosuite's gripper closes at +1.
+            command = np.concatenate([action[:6] / self._scale, [-action[6]]])
+            command = np.clip(command, -1.0, 1.0)
+        else:
+            command = np.clip(action, *self._environment.action_spec)
+        observation, reward, _, _ = self._environment.step(command)
         data = self._environment.sim.data
         if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
             self._steps = None
@@ -264,9 +310,10 @@ class RobosuiteWorld:
 
     def _parts(self) -> list[Any]:
         """Whatever remembers something from one step to the next."""
-        robot = self._robot
-        parts = [self._environment, robot, robot.composite_controller]
-        parts += list(robot.part_controllers.values()) + list(robot.gripper.values())
+        parts = [self._environment]
+        for robot in self._environment.robots:
+            parts += [robot, robot.composite_controller]
+            parts += list(robot.part_controllers.values()) + list(robot.gripper.values())
         buffers = [
             buffer for part in parts for value in vars(part).values() for buffer in _buffers(value)
         ]
@@ -279,7 +326,11 @@ class RobosuiteWorld:
         else:
             # OpenGL's rows start at the bottom.
             image = np.ascontiguousarray(observation[f"{self.task.camera}_image"][::-1])
-        self._last = Observation(image, self._state(), self.task.instruction)
+        if self.task.is_one_arm:
+            state = self._state()
+        else:
+            state = np.concatenate([numbers for _, numbers in _felt(observation)])
+        self._last = Observation(image, state.astype(np.float32), self.task.instruction)
         return self._last
 
     def _state(self) -> NDArray[np.float32]:

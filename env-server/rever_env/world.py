@@ -83,7 +83,11 @@ class World:
         self.memory: Memory | None = None
         self.steps = 0
         self.camera = Camera(self.model, task.settings.camera, image_height, image_width)
-        self._arm = [self.model.actuator(name).id for name in task.settings.arm_joints]
+        arm = [self.model.actuator(name).id for name in task.settings.arm_joints]
+        self._arm = slice(arm[0], arm[-1] + 1)
+        assert arm == list(range(arm[0], arm[-1] + 1)), "the arm's drives follow one another"
+        ramp_steps = round(task.settings.ramp / task.settings.timestep)
+        self._ramp = [index / ramp_steps for index in range(1, ramp_steps + 1)]
         self._fingers = [self.model.actuator(name).id for name in task.settings.finger_joints]
         self._finger_positions = [
             self.model.joint(name).qposadr[0] for name in task.settings.finger_joints
@@ -196,13 +200,13 @@ class World:
             settings.gripper_open - settings.gripper_closed
         )
         self.data.ctrl[self._fingers] = opening
-        start = self.data.ctrl[self._arm].copy()
-        ramp_steps = round(settings.ramp / settings.timestep)
-        for index in range(1, ramp_steps + 1):
-            self.data.ctrl[self._arm] = start + (target - start) * (index / ramp_steps)
+        control = self.data.ctrl[self._arm]  # a view
+        start = control.copy()
+        for share in self._ramp:
+            control[:] = start + (target - start) * share
             mujoco.mj_step(self.model, self.data)
-        self.data.ctrl[self._arm] = target
-        mujoco.mj_step(self.model, self.data, settings.substeps - ramp_steps)
+        control[:] = target
+        mujoco.mj_step(self.model, self.data, settings.substeps - len(self._ramp))
         self._refresh()
 
     def _refresh(self) -> None:

@@ -76,14 +76,38 @@ def test_what_is_wrong_is_said(worlds: list[RobosuiteWorld]) -> None:
     world = worlds[0]
     with pytest.raises(InvalidPlacement, match="Fold"):
         offered(["Fold"], ["Panda"], 6, 20.0)
-    with pytest.raises(InvalidPlacement, match="expected one arm"):
-        RobosuiteWorld(offered(["Lift"], ["Baxter"], 6, 20.0)["Lift/Baxter"], 0, 0)
+    with pytest.raises(InvalidPlacement, match="TwoArmLift with Panda"):
+        offered(["TwoArmLift"], ["Panda"], 6, 20.0)
     with pytest.raises(InvalidPlacement, match="configuration 0"):
         world.reset(configuration=0, seed=0)
     run(world, 0)
     world.step(MOVE)
     with pytest.raises(InvalidAction, match="step 7: expected at most 6"):
         world.step(MOVE)
+
+
+def test_two_arms_take_robosuites_own_actions() -> None:
+    world = RobosuiteWorld(
+        offered(["TwoArmLift"], ["Panda+UR5e"], 6, 20.0)["TwoArmLift/Panda+UR5e"], 24, 40
+    )
+    move = np.linspace(-0.5, 0.5, len(world.task.action))
+    assert len(move) == 14
+
+    def steps(count: int) -> list[Observation]:
+        return [world.step(move).observation for _ in range(count)]
+
+    expected = [world.reset(configuration=None, seed=2), *steps(2)]
+    assert len(expected[0].state) == len(world.task.state)
+    saved = world.save()
+    after = steps(3)
+    again = [world.reset(configuration=None, seed=2), *steps(2)]
+    assert all(same(*pair) for pair in zip(expected, again, strict=True))
+    world.reset(configuration=None, seed=3)
+    world.restore(saved)
+    assert all(same(*pair) for pair in zip(after, steps(3), strict=True))
+    with pytest.raises(InvalidAction, match=r"expected shape \(14,\)"):
+        world.step(MOVE)
+    world.close()
 
 
 @pytest.fixture(scope="module")
