@@ -1,10 +1,11 @@
 //! What `rever bench` prints and refuses; how fast anything is, no test says.
 
 use std::path::Path;
+use std::process::Command;
 
 use serde_json::Value;
 
-use crate::harness::{rever, run, succeed, text};
+use crate::harness::{repository, rever, run, succeed, text};
 
 #[test]
 fn a_benchmark_of_decisions_prints_a_table_and_writes_the_same_figures() {
@@ -15,6 +16,9 @@ fn a_benchmark_of_decisions_prints_a_table_and_writes_the_same_figures() {
     let table = succeed(&mut bench);
     let report: Value =
         serde_json::from_slice(&std::fs::read(&file).expect("the figures")).expect("JSON");
+    let head = succeed(Command::new("git").current_dir(repository()).args(["rev-parse", "HEAD"]));
+    let commit = report["commit"].as_str().expect("a commit").trim_end_matches("-dirty");
+    assert!(head.starts_with(commit) && commit.len() >= 7, "{commit}");
     let rows = report["rows"].as_array().expect("rows");
     let candidates: Vec<_> = rows.iter().map(|row| row["candidates"].as_u64()).collect();
     assert_eq!(candidates, [1, 1, 2, 5, 8, 16].map(Some));

@@ -1,12 +1,12 @@
 //! `rever bench`: what the parts of the program cost on this machine.
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
-use serde::Serialize;
 
 use super::episodes::policy_folder;
 use crate::bench::{
@@ -138,7 +138,21 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Part::Throughput(arguments) => throughput(arguments),
         Part::Wire(arguments) => wire(arguments),
         Part::Simulators(arguments) => simulators(arguments),
-    }
+    }?;
+    println!("commit {}", commit());
+    Ok(())
+}
+
+/// What was measured: the checkout's commit, `-dirty` when something in it differs.
+fn commit() -> String {
+    let describe = || -> Result<String> {
+        let mut git = Command::new("git");
+        git.args(["describe", "--always", "--dirty", "--abbrev=10"]);
+        let output = git.current_dir(setup::repository()?).output()?;
+        ensure!(output.status.success(), "no git checkout");
+        Ok(String::from_utf8(output.stdout)?.trim().to_owned())
+    };
+    describe().unwrap_or_else(|_| "unknown".to_owned())
 }
 
 fn wire(arguments: WireArguments) -> Result<()> {
@@ -148,7 +162,7 @@ fn wire(arguments: WireArguments) -> Result<()> {
     let rows =
         WireBench { site: &site, sessions: &sessions, steps, side: arguments.steps.side }.run()?;
     if let Some(path) = &arguments.steps.json {
-        write_json(path, &serde_json::json!({ "side": arguments.steps.side, "rows": rows }))?;
+        write_json(path, serde_json::json!({ "side": arguments.steps.side, "rows": rows }))?;
     }
     println!(
         "{:>8} {:>7} {:>9} {:>9} {:>9} {:>8}",
@@ -177,7 +191,7 @@ fn simulators(arguments: SimulatorsArguments) -> Result<()> {
         SimulatorsBench { site: &site, sessions: &sessions, steps, side: arguments.steps.side };
     let rows = bench.run()?;
     if let Some(path) = &arguments.steps.json {
-        write_json(path, &rows)?;
+        write_json(path, serde_json::json!({ "rows": rows }))?;
     }
     println!(
         "{:>6} {:>8} {:>7} {:>9} {:>9} {:>6}",
@@ -220,7 +234,7 @@ fn throughput(arguments: ThroughputArguments) -> Result<()> {
     };
     let rows = bench.run()?;
     if let Some(path) = &arguments.json {
-        write_json(path, &serde_json::json!({ "candidates": arguments.candidates, "rows": rows }))?;
+        write_json(path, serde_json::json!({ "candidates": arguments.candidates, "rows": rows }))?;
     }
     println!(
         "{:>8} {:>10} {:>12} {:>11} {:>9} {:>9}",
@@ -241,8 +255,10 @@ fn throughput(arguments: ThroughputArguments) -> Result<()> {
     Ok(())
 }
 
-fn write_json(path: &Path, figures: &impl Serialize) -> Result<()> {
-    let text = serde_json::to_string_pretty(figures)?;
+/// Writes an object of figures, with the commit.
+fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
+    figures["commit"] = commit().into();
+    let text = serde_json::to_string_pretty(&figures)?;
     std::fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
 }
 
@@ -274,7 +290,7 @@ fn decision(arguments: DecisionArguments) -> Result<()> {
     let report = bench.run(torch, |round| progress.set_position(round as u64))?;
     progress.finish_and_clear();
     if let Some(path) = &arguments.json {
-        write_json(path, &report)?;
+        write_json(path, serde_json::to_value(&report)?)?;
     }
     print(&report);
     Ok(())
