@@ -160,7 +160,7 @@ class GymnasiumWorld:
     def save(self) -> Any:
         """The way to this state, and what is seen here."""
         seed = self._running()
-        return seed, list(self._actions), self._numbers()
+        return seed, list(self._actions), self._seen()
 
     def restore(self, content: Any) -> Observation:
         """Goes the same way again."""
@@ -169,7 +169,7 @@ class GymnasiumWorld:
         for action in actions:
             # With its picture, for some environments change their physics when they draw.
             observation = self._advance(action)[0]
-        if not np.array_equal(self._numbers(), expected):
+        if not all(map(np.array_equal, self._seen(), expected)):
             self._start = None
             raise NotReproducible(f"task {self.task.name}: the same actions led to another state")
         return observation
@@ -230,6 +230,11 @@ class GymnasiumWorld:
     def _numbers(self) -> NDArray[np.float32]:
         numbers = numbers_of(self._environment.observation_space, self._last)
         return np.array(numbers, np.float32)
+
+    def _seen(self) -> list[NDArray[Any]]:
+        """The whole observation: its numbers and its pictures."""
+        pictures = images_of(self._environment.observation_space, self._last)
+        return [self._numbers(), *(picture.copy() for picture in pictures)]
 
     def _observe(self) -> Observation:
         numbers = self._numbers()

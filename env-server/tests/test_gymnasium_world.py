@@ -120,6 +120,24 @@ def test_save_and_restore_are_exact(pair: list[GymnasiumWorld]) -> None:
         assert (again.reward, again.terminated) == (before.reward, before.terminated)
 
 
+def test_a_picture_in_the_observation_is_the_image() -> None:
+    making = Making({"render_mode": "rgb_array"}, gymnasium.wrappers.AddRenderObservation)
+    task = offered(["CartPole-v1"], [], making, 50)["CartPole-v1"]
+    assert (len(task.state), task.has_image) == (0, True)
+    world = GymnasiumWorld(task, 400, 600)
+    world.reset(configuration=None, seed=1)
+    first = world.step(np.array([1.0])).observation
+    own: Any = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    own.reset(seed=1)
+    own.step(1)
+    assert np.array_equal(first.image, own.render())  # its own size: nothing is resized
+    saved = world.save()
+    world.step(np.array([0.0]))
+    assert same(world.restore(saved), first)
+    half = GymnasiumWorld(task, 200, 300).reset(configuration=None, seed=1).image
+    assert half.shape == (200, 300, 3) and half.std() > 1.0
+
+
 def test_a_space_becomes_numbers_and_numbers_a_value() -> None:
     described = dimensions_of(NESTED, "see")
     assert [dimension.name for dimension in described] == [
