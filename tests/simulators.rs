@@ -36,7 +36,7 @@ const BROKEN: [(&str, &[&str]); 7] = [
     ),
     ("jumps_gaps,forgets_command,steps_unreset", &["gap", "save", "reset_first"]),
     ("one_seed,no_limit", &["seeds", "sessions_max"]),
-    ("forgets_close,any_length", &["close", "dimensions"]),
+    ("forgets_close,any_length", &["sessions_max", "dimensions"]),
     ("keeps_leases", &["holder_gone", "holder_missing", "idle"]),
 ];
 

@@ -40,6 +40,7 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
         })
         .await;
     refusals(subject, table).await;
+    wrong_actions(subject, table).await;
 }
 
 /// What leaves the world as it was.
@@ -71,6 +72,24 @@ async fn refusals(subject: &Subject<'_>, table: &mut Table<'_>) {
             unchanged(subject, talk).await
         })
         .await;
+    table
+        .row("slots", "a slot from 16 on is refused, and so is an empty one", async {
+            let mut talk = subject.episode(0).await?;
+            let sequence = talk.sequence + 1;
+            let bytes = unchecked(&Request::Save { sequence, slot: limits::SLOTS_MAX });
+            names(&talk.refusal_of(&bytes, sequence).await?, &["slot"])?;
+            talk.sequence = sequence;
+            names(
+                &talk.refused(|sequence| Request::Restore { sequence, slot: 3 }).await?,
+                &["slot"],
+            )?;
+            unchanged(subject, talk).await
+        })
+        .await;
+}
+
+/// Actions that no task of this description takes.
+async fn wrong_actions(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row("values", "an action with NaN or infinity is refused; its number is used up", async {
             let mut talk = subject.episode(0).await?;
@@ -105,20 +124,6 @@ async fn refusals(subject: &Subject<'_>, table: &mut Table<'_>) {
             "a discrete number that is not whole or out of bounds is refused; its number is used up",
             discrete(subject),
         )
-        .await;
-    table
-        .row("slots", "a slot from 16 on is refused, and so is an empty one", async {
-            let mut talk = subject.episode(0).await?;
-            let sequence = talk.sequence + 1;
-            let bytes = unchecked(&Request::Save { sequence, slot: limits::SLOTS_MAX });
-            names(&talk.refusal_of(&bytes, sequence).await?, &["slot"])?;
-            talk.sequence = sequence;
-            names(
-                &talk.refused(|sequence| Request::Restore { sequence, slot: 3 }).await?,
-                &["slot"],
-            )?;
-            unchanged(subject, talk).await
-        })
         .await;
 }
 
