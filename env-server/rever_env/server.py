@@ -65,7 +65,10 @@ class _Lease:
 
 
 class Server:
-    """run() serves until stop is set, in the thread that calls it."""
+    """run() serves until stop is set, in the thread that calls it.
+
+    ValueError for options or worlds that the protocol has no room for.
+    """
 
     def __init__(self, network: zenoh.Session, worlds: Worlds, options: ServerOptions) -> None:
         if not 1 <= options.sessions_max <= limits.SESSIONS_MAX:
@@ -82,6 +85,7 @@ class Server:
         # The simple queue wakes its reader faster than the bounded one; the callback bounds it.
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._work_max = (options.sessions_max + 1) * _PENDING_PER_SESSION_MAX
+        self._description()  # worlds that cannot be described are refused now
 
     def run(self, stop: threading.Event, ready: Callable[[str], None]) -> None:
         """Declares everything, the liveliness token last; then works until stop is set."""
@@ -136,6 +140,10 @@ class Server:
         return callback
 
     def _describe(self, query: Any) -> None:
+        with query:
+            query.reply(self._keys.describe(self.id), self._description())
+
+    def _description(self) -> bytes:
         description = protocol.Description(
             protocol=protocol.PROTOCOL_VERSION,
             server=self.id,
@@ -160,8 +168,7 @@ class Server:
             slots_max=limits.SLOTS_MAX,
             idle_secs_max=self._options.idle_secs_max,
         )
-        with query:
-            query.reply(self._keys.describe(self.id), protocol.DESCRIPTION.encode(description))
+        return protocol.DESCRIPTION.encode(description)
 
     def _open(self, query: Any) -> None:
         answer: protocol.Opened | protocol.OpenRefused

@@ -162,7 +162,11 @@ def serve(arguments: argparse.Namespace) -> int:
         print(f"error: cannot open the network: {error}", file=sys.stderr)
         return 1
     with network:
-        server = Server(network, worlds, options)
+        try:
+            server = Server(network, worlds, options)
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
 
         def ready(name: str) -> None:
             if arguments.id_file:

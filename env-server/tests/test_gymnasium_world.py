@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
 from rever_env.gymnasium_world import GymnasiumWorld, Making, NotReproducible, imported, offered
 from rever_env.protocol import Dimension
+from rever_env.server import Server, ServerOptions
 from rever_env.spaces import dimensions_of, numbers_of, value_of
 from rever_env.world import Observation
+from rever_env.worlds import Worlds
 
 pytest.importorskip("gymnasium_robotics")
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs no screen
@@ -44,6 +46,12 @@ class Fickle(gymnasium.Env[NDArray[np.float32], Any]):
     def step(self, action: int) -> Any:
         seen = np.array([np.nan if action else Fickle.resets], np.float32)
         return seen, 1.0, False, False, {}
+
+
+class Wide(Fickle):
+    """Has more numbers than fit into a Step."""
+
+    action_space: spaces.Space[Any] = spaces.Box(-1.0, 1.0, (200,))
 
 
 def make(name: str, height: int, width: int, *imports: str) -> GymnasiumWorld:
@@ -196,6 +204,17 @@ def test_what_is_wrong_is_said() -> None:
         pass
     with pytest.raises(InvalidAction, match="it has ended"):
         world.step(np.array([0.0]))
+
+
+def test_a_task_that_the_protocol_has_no_room_for_is_not_served() -> None:
+    gymnasium.register("rever-tests/Wide-v0", entry_point=lambda **_: Wide())
+    try:
+        worlds = Worlds(offered(["rever-tests/Wide-v0"], [], Making(), 50), 1, GymnasiumWorld)
+        network: Any = None
+        with pytest.raises(ValueError, match="action: expected 1 to 128 numbers, got 200"):
+            Server(network, worlds, ServerOptions())
+    finally:
+        del gymnasium.registry["rever-tests/Wide-v0"]
 
 
 def test_an_environment_that_breaks_or_does_not_repeat_itself_is_a_fault() -> None:
