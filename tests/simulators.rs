@@ -144,8 +144,31 @@ fn a_gymnasium_environment_conforms() {
     assert_eq!(passed, said.lines().filter(|line| !line.contains(" passed, ")).count(), "{said}");
 }
 
+#[test]
+fn a_task_that_no_policy_fits_is_refused_in_words() {
+    let mut command = python().command();
+    command.args(["-m", "rever_env", "serve", "--gymnasium", "CartPole-v1"]);
+    serving(&mut command, |endpoint| {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut evaluate = rever();
+        evaluate.args(["evaluate", "--connect", endpoint, "--tasks", "CartPole-v1"]);
+        evaluate.args(["--strategies", "greedy", "--episodes", "1", "--out"]);
+        let output = run(evaluate.arg(folder.path().join("run")));
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        let words =
+            "expected a state of 8 and an action of 7 numbers, as the policy has, got 4 and 1";
+        assert!(said.contains("task CartPole-v1") && said.contains(words), "{said}");
+    });
+}
+
 /// Of a server that is started with this command and the options that a test needs.
 fn conformance_of(command: &mut Command) -> (BTreeSet<String>, usize, String) {
+    serving(command, |endpoint| conformance(&["--connect", endpoint]))
+}
+
+/// While a server runs that is started with this command.
+fn serving<T>(command: &mut Command, act: impl FnOnce(&str) -> T) -> T {
     let endpoint = free_endpoint();
     let mut server = command
         .args(["--sessions", "4", "--idle-secs", "12"])
@@ -155,10 +178,10 @@ fn conformance_of(command: &mut Command) -> (BTreeSet<String>, usize, String) {
         .stderr(Stdio::null())
         .spawn()
         .expect("the server starts");
-    let rows = conformance(&["--connect", &endpoint]);
+    let result = act(&endpoint);
     server.kill().expect("the server runs");
     server.wait().expect("a killed server ends");
-    rows
+    result
 }
 
 #[test]

@@ -72,6 +72,10 @@ impl<'a> Crew<'a> {
     pub async fn seat(&mut self, job: &Job, must: bool) -> Result<Option<(Seat, Environment)>> {
         let is_short = self.servers.len() < self.servers_max;
         self.look(if is_short { LOOK_EVERY } else { LOOK_EVERY_WHEN_COMPLETE }, 1).await?;
+        // All servers of a run are of one simulator: another one would not fit better.
+        if let Some(reason) = self.servers.iter().find_map(|server| unfit(server, job)) {
+            bail!("{reason}");
+        }
         let has_expert = job.arm.strategy.needs_expert();
         if let Some(index) = self.free.iter().position(|(seat, _)| seat.has_expert == has_expert) {
             return Ok(Some(self.free.swap_remove(index)));
@@ -173,15 +177,10 @@ impl<'a> Crew<'a> {
         job: &Job,
         has_expert: bool,
     ) -> Result<(Seat, Environment), Vec<String>> {
-        let mut refusals = Vec::new();
-        let mut servers: Vec<(String, String)> = Vec::new();
-        for server in &self.servers {
-            match unfit(server, job) {
-                Some(reason) => refusals.push(reason),
-                None => servers.push((server.server.clone(), simulator(server))),
-            }
-        }
+        let mut servers: Vec<(String, String)> =
+            self.servers.iter().map(|server| (server.server.clone(), simulator(server))).collect();
         servers.sort_by_key(|(server, _)| self.in_use.get(server).copied().unwrap_or(0));
+        let mut refusals = Vec::new();
         for (server, simulator) in servers {
             let open = Open {
                 protocol: PROTOCOL_VERSION,

@@ -24,11 +24,9 @@ impl Episode {
         environment: Environment,
         observation: Observation,
     ) -> Result<Self, EnvironmentFault> {
-        let (state, expert_action) = ([0.0; STATE_LENGTH], None);
-        let mut episode =
-            Self { environment, observation: observation.clone(), state, expert_action };
-        episode.observe(observation)?;
-        Ok(episode)
+        environment.check_image(&observation.image)?;
+        let (state, expert_action) = numbers(&observation)?;
+        Ok(Self { environment, observation, state, expert_action })
     }
 
     /// What the policy sees now.
@@ -98,17 +96,22 @@ impl Episode {
 
     fn observe(&mut self, observation: Observation) -> Result<(), EnvironmentFault> {
         self.environment.check_image(&observation.image)?;
-        self.state = numbers("a state", &observation.state)?;
-        let expert_action = observation.expert_action.as_deref();
-        self.expert_action =
-            expert_action.map(|action| numbers("an expert's action", action)).transpose()?;
+        (self.state, self.expert_action) = numbers(&observation)?;
         self.observation = observation;
         Ok(())
     }
 }
 
-/// Policies and verifiers are made for Bridge's states and actions.
-fn numbers<const N: usize>(what: &str, values: &[f32]) -> Result<[f32; N], EnvironmentFault> {
+type Numbers = ([f32; STATE_LENGTH], Option<[f32; ACTION_LENGTH]>);
+
+/// State and expert's action, of the lengths that policies and verifiers are made for.
+fn numbers(observation: &Observation) -> Result<Numbers, EnvironmentFault> {
+    let expert_action = observation.expert_action.as_deref();
+    let expert_action = expert_action.map(|action| array("an expert's action", action));
+    Ok((array("a state", &observation.state)?, expert_action.transpose()?))
+}
+
+fn array<const N: usize>(what: &str, values: &[f32]) -> Result<[f32; N], EnvironmentFault> {
     values.try_into().map_err(|_| {
         EnvironmentFault::wire(format!("expected {what} of {N} numbers, got {}", values.len()))
     })
