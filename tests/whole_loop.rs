@@ -80,7 +80,7 @@ fn the_result_file_has_the_documented_shape() {
         for key in ["candidates", "episodes", "faults"] {
             assert!(row[key].is_u64(), "{key} in {row}");
         }
-        for key in ["grasp", "success", "success_low", "success_high"] {
+        for key in ["grasp", "grasp_low", "grasp_high", "success", "success_low", "success_high"] {
             assert!(
                 row[key].as_f64().is_some_and(|rate| (0.0..=1.0).contains(&rate)),
                 "{key} in {row}"

@@ -47,6 +47,10 @@ pub struct Row {
     pub faults: u64,
     /// The object was held at some step.
     pub grasp: Option<f64>,
+    /// Lower end of the 95 % Wilson interval of `grasp`.
+    pub grasp_low: f64,
+    /// Upper end.
+    pub grasp_high: f64,
     /// Success at the last step.
     pub success: Option<f64>,
     /// Lower end of the 95 % Wilson interval of `success`.
@@ -138,7 +142,7 @@ impl ResultFile {
 
 fn row(task: &str, arm: &Arm, rates: &Rates) -> Row {
     let value = |rate: Rate| rate.value();
-    let interval = rates.success.interval();
+    let (grasp, interval) = (rates.grasped.interval(), rates.success.interval());
     Row {
         task: task.to_owned(),
         variant: VARIANT_DEFAULT.to_owned(),
@@ -148,6 +152,8 @@ fn row(task: &str, arm: &Arm, rates: &Rates) -> Row {
         episodes: rates.success.trials,
         faults: rates.faults,
         grasp: value(rates.grasped),
+        grasp_low: grasp.low,
+        grasp_high: grasp.high,
         success: value(rates.success),
         success_low: interval.low,
         success_high: interval.high,

@@ -15,7 +15,7 @@ pub fn text(results: &Results) -> String {
 /// One block per task and one for all: SIMPLER's result first, the other readings of success beside it.
 fn rates(results: &Results) -> String {
     let mut rows = vec![
-        ["", "success %", "95 %", "grasp %", "any step %", "released %", "n", "faults"]
+        ["", "success %", "95 %", "grasp %", "95 %", "any step %", "released %", "n", "faults"]
             .map(str::to_owned)
             .to_vec(),
     ];
@@ -30,12 +30,16 @@ fn rates(results: &Results) -> String {
 }
 
 fn rate_row(result: &ArmResult, rates: &Rates) -> Vec<String> {
-    let interval = rates.success.interval();
+    let interval = |rate: Rate| {
+        let interval = rate.interval();
+        format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high)
+    };
     vec![
         format!("  {}", result.arm),
         percent(rates.success),
-        format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high),
+        interval(rates.success),
         percent(rates.grasped),
+        interval(rates.grasped),
         percent(rates.ever_success),
         percent(rates.released_success),
         rates.success.trials.to_string(),
