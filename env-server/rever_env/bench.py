@@ -4,6 +4,7 @@ Blocks of steps are taken in turns, so that a machine that slows down slows all 
 """
 
 import json
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -58,10 +59,27 @@ def bench(
     print(f"{side} x {side} pixels, {_CONTROL_HZ} Hz control")
     for name, ratio in ratios.items():
         print(f"{name} {ratio:.2f}")
+    print(f"commit {_commit()}")
     if file:
-        figures = {"side": side, "rows": [asdict(row) for row in rows], **ratios}
+        figures = {
+            "side": side,
+            "rows": [asdict(row) for row in rows],
+            **ratios,
+            "commit": _commit(),
+        }
         file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     return 0
+
+
+def _commit() -> str:
+    """What was measured: the checkout's commit, -dirty when something in it differs."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
+    folder = Path(__file__).resolve().parent
+    try:
+        told = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return told.stdout.strip()
 
 
 def measure(tasks: list[Task], side: int, steps: int, other: Block | None = None) -> list[Row]:

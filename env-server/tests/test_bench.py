@@ -27,6 +27,7 @@ def test_a_step_is_timed_beside_what_it_is_made_of(tmp_path: Path) -> None:
     assert all(row["steps"] == 70 and row["p50_ms"] > 0 for row in figures["rows"])
     assert f"ratio_bare {figures['ratio_bare']:.2f}" in done.stdout
     assert "ratio_robosuite" not in figures
+    assert f"commit {figures['commit']}" in done.stdout
 
 
 def test_what_cannot_be_timed_is_refused_in_words() -> None:
