@@ -151,6 +151,7 @@ fn a_task_that_no_policy_fits_is_refused_in_words() {
     serving(&mut command, |endpoint| {
         let folder = tempfile::tempdir().expect("a folder");
         let mut evaluate = rever();
+        evaluate.current_dir(folder.path());
         evaluate.args(["evaluate", "--connect", endpoint, "--tasks", "CartPole-v1"]);
         evaluate.args(["--strategies", "greedy", "--episodes", "1", "--out"]);
         let output = run(evaluate.arg(folder.path().join("run")));

@@ -90,23 +90,22 @@ class Judge:
         robot = target = elsewhere = False
         wrench = np.zeros(6)
         force = np.zeros(3)
-        for index in range(data.ncon):
-            contact = data.contact[index]
-            bodies = self._model.geom_bodyid[contact.geom1], self._model.geom_bodyid[contact.geom2]
-            if self._source not in bodies or bodies[0] == bodies[1]:
-                continue
+        pairs = self._model.geom_bodyid[data.contact.geom]  # (contacts, 2)
+        for index in np.flatnonzero((pairs == self._source).sum(axis=1) == 1).tolist():
+            bodies = pairs[index].tolist()
             mujoco.mj_contactForce(self._model, data, index, wrench)
             if norm(wrench[:3]) * self._task.settings.timestep < self._task.grasp.impulse_min:
                 continue
             other = bodies[1] if bodies[0] == self._source else bodies[0]
             if other in self._fingers:
-                mujoco.mju_mulMatTVec(force, contact.frame.reshape(3, 3), wrench[:3])
+                frame = data.contact.frame[index].reshape(3, 3)
+                mujoco.mju_mulMatTVec(force, frame, wrench[:3])
                 # The contact force acts on the second geom's body; flip it when that is the finger.
                 sign = 1.0 if bodies[1] == self._source else -1.0
                 fingers[self._fingers.index(other)][:] += sign * force
             robot |= self._is_robot[other]
-            target |= bool(other == self._target)
-            elsewhere |= bool(other != self._target and not self._is_robot[other])
+            target |= other == self._target
+            elsewhere |= other != self._target and not self._is_robot[other]
         return Touch(fingers, robot, target, elsewhere)
 
     def grasped(self, data: mujoco.MjData, touch: Touch) -> bool:

@@ -39,6 +39,14 @@ _START_GAP = 0.002  # objects start this far above rest, metres
 # m/s or rad/s: beyond this the physics is broken, not fast. What falls off the table lands on an
 # edge and spins at more than 100 rad/s.
 _SPEED_MAX = 1000.0
+_DIVERGENCE = {
+    int(warning): warning.name
+    for warning in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    )
+}
 # Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
 DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
@@ -92,6 +100,8 @@ class World:
         self._finger_positions = [
             self.model.joint(name).qposadr[0] for name in task.settings.finger_joints
         ]
+        self._base = self.model.body(task.settings.robot_body).id
+        self._tcp = self.model.site(task.settings.tcp).id
         self._finger_range = self.model.joint(task.settings.finger_joints[0]).range.copy()
 
     def reset(self, *, configuration: int | None, seed: int) -> Observation:
@@ -217,17 +227,11 @@ class World:
         warm_start = self.data.qacc_warmstart.copy()
         mujoco.mj_forward(self.model, self.data)
         self.data.qacc_warmstart[:] = warm_start
-        diverged = [
-            warning.name
-            for warning in (
-                mujoco.mjtWarning.mjWARN_BADQPOS,
-                mujoco.mjtWarning.mjWARN_BADQVEL,
-                mujoco.mjtWarning.mjWARN_BADQACC,
-            )
-            if self.data.warning[warning].number > 0
-        ]
-        fastest = int(np.abs(self.data.qvel).argmax())
-        speed = float(np.abs(self.data.qvel[fastest]))
+        speeds = np.abs(self.data.qvel)
+        fastest = int(speeds.argmax())
+        speed = float(speeds[fastest])
+        warnings = self.data.warning.number
+        diverged = [name for index, name in _DIVERGENCE.items() if warnings[index] > 0]
         if diverged or not np.isfinite(self.data.qpos).all() or not speed <= _SPEED_MAX:
             self.memory = None
             raise PhysicsDiverged(
@@ -245,10 +249,9 @@ class World:
 
     def _state(self) -> NDArray[np.float32]:
         data = self.data
-        base = self.model.body(self.task.settings.robot_body).id
-        site = self.model.site(self.task.settings.tcp).id
+        base, tcp = self._base, self._tcp
         pose = in_base(
-            data.xpos[base], data.xmat[base], data.site_xpos[site], data.site_xmat[site], DOWN
+            data.xpos[base], data.xmat[base], data.site_xpos[tcp], data.site_xmat[tcp], DOWN
         )
         return np.array([*pose, 0.0, self.gripper_opening()], np.float32)
 
