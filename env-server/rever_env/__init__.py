@@ -2,7 +2,7 @@
 
 tasks.toml -> tasks -> placement -> world (controller, success, camera, snapshot)
 world -> expert -> reasoning -> demonstrations; world -> gymnasium_env
-world, robosuite_world -> worlds -> session -> server
+world, robosuite_world, gymnasium_world -> worlds -> session -> server
 server -> remote_session -> remote: the same as Gymnasium environments, in another process
 """
 

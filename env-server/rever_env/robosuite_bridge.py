@@ -13,7 +13,7 @@ from robosuite.models.tasks import ManipulationTask
 from rever_env import expert, tasks
 from rever_env.placement import SEED_LIMIT, place
 from rever_env.protocol import Statistics
-from rever_env.robosuite_models import WidowX, bridge_arena
+from rever_env.robosuite_models import WidowX, bridge_arena, fit_scene
 from rever_env.success import Judge, Memory
 from rever_env.tasks import Placement, Task
 from rever_env.world import place_objects
@@ -130,6 +130,7 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
             mujoco_robots=[robot.robot_model],
             mujoco_objects=[],
         )
+        fit_scene(self.model.root, robot.robot_model, self.task)
         # The damping of the fingers' drives makes explicit Euler diverge.
         self.model.root.find("option").set("integrator", "implicitfast")
 

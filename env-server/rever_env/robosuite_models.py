@@ -34,6 +34,22 @@ def bridge_arena(task: Task) -> Arena:
         return Arena(path)
 
 
+def fit_scene(model: Element, robot: ManipulatorModel, task: Task) -> None:
+    """Puts robot and camera where the task's scene has them, and lights it as the scene does."""
+    scene = _scene(task.scene)
+    base, root = _base(scene), robot.worldbody.find("body")
+    root.attrib.update({name: base.attrib[name] for name in ("pos", "quat")})
+    camera = {**base.find("camera").attrib}  # type: ignore[union-attr]
+    camera.pop("name")
+    root.find("camera").attrib.update(camera)
+    visual = model.find("visual")
+    assert visual is not None, "robosuite's models have one"
+    for wanted in (element for some in scene.findall("visual") for element in some):
+        if wanted.tag in ("headlight", "map", "quality"):
+            visual[:] = [element for element in visual if element.tag != wanted.tag]
+            visual.append(wanted)
+
+
 @register_gripper
 class WidowXGripper(GripperModel):  # type: ignore[misc]
     """The WidowX's two fingers; one command, -1 open, +1 closed."""
@@ -118,7 +134,7 @@ def _any_task() -> Task:
 
 
 def _any_scene() -> Element:
-    """The robot is the same in every scene."""
+    """The robot is the same in every scene; where it stands is not: fit_scene."""
     return _scene(_any_task().scene)
 
 
@@ -232,10 +248,7 @@ def _arena(scene: Element) -> Element:
     bodies = [node for node in _worldbody(scene) if node.get("name") != "base_link"]
     for index, body in enumerate(bodies):
         _name_geoms(body, f"arena_{index}")
-    model = _model("bridge", scene, bodies)
-    for visual in scene.findall("visual"):
-        model.append(visual)
-    return model
+    return _model("bridge", scene, bodies)
 
 
 def _model(name: str, scene: Element, bodies: list[Element]) -> Element:

@@ -118,15 +118,18 @@ def bridge() -> Iterator[RobosuiteWorld]:
     world.close()
 
 
-def test_a_bridge_task_starts_where_ours_does(bridge: RobosuiteWorld) -> None:
+@pytest.mark.parametrize("task", list(tasks.load()))
+def test_a_bridge_task_starts_as_ours_does(task: str) -> None:
+    bridge = RobosuiteWorld(offered([task], [], 6, 20.0)[task], 96, 128)
     seen = bridge.reset(configuration=5, seed=0)
-    with World(tasks.load()["widowx_stack_cube"], 24, 40) as ours:
+    bridge.close()
+    with World(tasks.load()[task], 96, 128) as ours:
         expected = ours.reset(configuration=5, seed=0)
-    assert np.abs(seen.state - expected.state).max() < 0.01
+    assert np.abs(seen.state - expected.state).max() < 1e-3
     assert seen.instruction == expected.instruction
-    # Another renderer's settings and another solver's, but the same scene.
+    # Objects settle a little differently under robosuite's solver; nothing else may differ.
     difference = seen.image.astype(float) - expected.image.astype(float)
-    assert np.abs(difference).mean() < 10.0
+    assert np.abs(difference).mean() < 0.1
 
 
 def test_bridge_tasks_are_reproducible_and_saved_exactly(bridge: RobosuiteWorld) -> None:
