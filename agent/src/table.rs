@@ -30,10 +30,6 @@ fn rates(results: &Results) -> String {
 }
 
 fn rate_row(result: &ArmResult, rates: &Rates) -> Vec<String> {
-    let interval = |rate: Rate| {
-        let interval = rate.interval();
-        format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high)
-    };
     vec![
         format!("  {}", result.arm),
         percent(rates.success),
@@ -88,17 +84,21 @@ fn by_candidates(results: &Results) -> String {
                 continue;
             }
             for point in points {
-                let interval = point.all.success.interval();
                 rows.push(vec![
                     format!("  {strategy} T={temperature}"),
                     point.arm.candidates.to_string(),
                     percent(point.all.success),
-                    format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high),
+                    interval(point.all.success),
                 ]);
             }
         }
     }
     if rows.len() == 1 { String::new() } else { aligned(&rows) }
+}
+
+fn interval(rate: Rate) -> String {
+    let interval = rate.interval();
+    format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high)
 }
 
 fn decisions(results: &Results) -> String {

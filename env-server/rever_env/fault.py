@@ -18,4 +18,4 @@ class InvalidAction(Fault):
 
 
 class InvalidPlacement(Fault):
-    """The configuration or seed is out of range, or no free placement was found."""
+    """What is asked for is not there: a task, a configuration, a seed, a free placement."""

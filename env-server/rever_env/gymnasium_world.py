@@ -17,8 +17,10 @@ from rever_env.fault import (
     PhysicsDiverged,
     RendererUnavailable,
 )
-from rever_env.protocol import Dimension, Statistics
+from rever_env.placement import check_configuration
+from rever_env.protocol import Dimension
 from rever_env.spaces import dimensions_of, images_of, numbers_of, value_of
+from rever_env.success import success_alone
 from rever_env.world import Observation, Transition
 
 _SUCCESSES = ("is_success", "success")
@@ -54,11 +56,17 @@ class GymnasiumTask:
     steps_max: int
     state: tuple[Dimension, ...]
     action: tuple[Dimension, ...]
-    has_image: bool
+    shows_itself: bool  # a picture is in the observation
+    renders: bool
     making: Making
     variant: str = "default"
     version: int = 1
     configurations: tuple[()] = ()  # the seed draws every start
+
+    @property
+    def has_image(self) -> bool:
+        """Whether there is a picture at all."""
+        return self.shows_itself or self.renders
 
 
 def offered(
@@ -110,7 +118,6 @@ class GymnasiumWorld:
                 f"task {task.name} has no image: expected 0 x 0, got {image_height} x {image_width}"
             )
         self._environment = _make(task, self._size)
-        self._shows_itself = bool(images_of(self._environment.observation_space, None))
         threshold = self._environment.spec.reward_threshold if self._environment.spec else None
         self._reward_threshold = np.inf if threshold is None else threshold
         self._start: int | None = None
@@ -122,11 +129,7 @@ class GymnasiumWorld:
 
     def reset(self, *, configuration: int | None, seed: int) -> Observation:
         """The same seed gives the same start, if the environment keeps Gymnasium's contract."""
-        if configuration is not None:
-            raise InvalidPlacement(
-                f"configuration {configuration}: expected 0 <= configuration < 0 "
-                f"for task {self.task.name}"
-            )
+        check_configuration(self.task.name, configuration, 0)
         return self._begin(seed)
 
     def step(self, action: NDArray[np.float64]) -> Transition:
@@ -138,20 +141,9 @@ class GymnasiumWorld:
             )
         self._check(action)
         observation, reward, terminated, truncated, info = self._advance(action)
-        is_success = self._is_success(info)
         return Transition(
             observation=observation,
-            statistics=Statistics(
-                is_success=is_success,
-                is_grasped=False,
-                ever_grasped=False,
-                consecutive_grasp=False,
-                moved_correct_object=False,
-                moved_wrong_object=False,
-                source_on_target=is_success,
-                ever_success=self._ever_success,
-                released_success=False,
-            ),
+            statistics=success_alone(self._is_success(info), self._ever_success),
             reward=reward,
             terminated=terminated,
             truncated=truncated,
@@ -248,7 +240,7 @@ class GymnasiumWorld:
         height, width = self._size
         if self._size == (0, 0):
             return np.empty((0, 0, 3), np.uint8)
-        if self._shows_itself:
+        if self.task.shows_itself:
             image = images_of(self._environment.observation_space, self._last)[0]
         else:
             image = self._rendered()
@@ -290,15 +282,14 @@ def _task(name: str, making: Making, horizon: int) -> GymnasiumTask:
             raise InvalidPlacement(f"environment {name}: expected actions of numbers, got none")
         spec = environment.spec
         steps_max = spec.max_episode_steps if spec else None
-        renders = "rgb_array" in environment.metadata.get("render_modes", [])
-        shows_itself = bool(images_of(environment.observation_space, None))
         return GymnasiumTask(
             name,
             name,
             horizon if steps_max is None else steps_max,
             state,
             action,
-            renders or shows_itself,
+            bool(images_of(environment.observation_space, None)),
+            "rgb_array" in environment.metadata.get("render_modes", []),
             making,
         )
     finally:
@@ -307,12 +298,8 @@ def _task(name: str, making: Making, horizon: int) -> GymnasiumTask:
 
 def _make(task: GymnasiumTask, size: tuple[int, int]) -> "gymnasium.Env[Any, Any]":
     """With a picture of that size where the environment lets it be chosen, or of any, or none."""
-    if size == (0, 0):
+    if size == (0, 0) or task.shows_itself:
         return task.making.make(task.name)
-    environment = task.making.make(task.name)
-    if images_of(environment.observation_space, None):
-        return environment
-    environment.close()
     height, width = size
     try:
         return task.making.make(task.name, render_mode="rgb_array", height=height, width=width)

@@ -33,14 +33,16 @@ def place(task: Task, configuration: int | None, seed: int) -> Placement:
     """The placement of one reset: a grid configuration, or a draw from the seed."""
     if not 0 <= seed < SEED_LIMIT:
         raise InvalidPlacement(f"seed {seed}: expected 0 <= seed < 2^53")
-    if configuration is None:
-        return _draw(task, seed)
-    if not 0 <= configuration < len(task.configurations):
+    check_configuration(task.name, configuration, len(task.configurations))
+    return _draw(task, seed) if configuration is None else task.configurations[configuration]
+
+
+def check_configuration(task: str, configuration: int | None, count: int) -> None:
+    """InvalidPlacement for a configuration beyond the task's count; None is a random placement."""
+    if configuration is not None and not 0 <= configuration < count:
         raise InvalidPlacement(
-            f"configuration {configuration}: expected 0 <= configuration < "
-            f"{len(task.configurations)} for task {task.name}"
+            f"configuration {configuration}: expected 0 <= configuration < {count} for task {task}"
         )
-    return task.configurations[configuration]
 
 
 def near_configuration(task: Task, placement: Placement) -> bool:

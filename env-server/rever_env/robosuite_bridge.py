@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass, replace
+from types import new_class
 from typing import Any
 
 import mujoco
@@ -164,34 +165,15 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         self.sim.forward()
 
 
-class SpoonOnTowel(BridgeTask):
-    """Put the spoon on the towel."""
-
-    task_name = "widowx_spoon_on_towel"
-
-
-class CarrotOnPlate(BridgeTask):
-    """Put the carrot on the plate."""
-
-    task_name = "widowx_carrot_on_plate"
+def _environment(task: Task) -> str:
+    """The name of a task's class, which robosuite registers when it is made."""
+    name = task.gymnasium_id.removeprefix("rever/").partition("-")[0]
+    body = {"task_name": task.name, "__doc__": task.instruction}
+    new_class(name, (BridgeTask,), exec_body=lambda namespace: namespace.update(body))
+    return name
 
 
-class StackCube(BridgeTask):
-    """Stack the green cube on the yellow one."""
-
-    task_name = "widowx_stack_cube"
-
-
-class EggplantInBasket(BridgeTask):
-    """Put the eggplant into the basket."""
-
-    task_name = "widowx_put_eggplant_in_basket"
-
-
-ENVIRONMENTS = {
-    kind.task_name: kind.__name__
-    for kind in (SpoonOnTowel, CarrotOnPlate, StackCube, EggplantInBasket)
-}
+ENVIRONMENTS = {task.name: _environment(task) for task in tasks.load().values()}
 
 
 def _renamed(task: Task) -> Task:

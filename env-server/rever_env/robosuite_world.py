@@ -1,7 +1,7 @@
 """robosuite's environments behind the protocol: any of its tasks with any of its robots."""
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from rever_env import tasks
 from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
+from rever_env.placement import check_configuration
 from rever_env.pose import in_base
 from rever_env.protocol import Dimension, Statistics
+from rever_env.success import success_alone
 from rever_env.world import DOWN, Observation, Transition
 
 # What robosuite's documentation says each task is about.
@@ -55,7 +57,7 @@ class RobosuiteTask:
 
 
 def offered(
-    names: Iterable[str], robots: Iterable[str], steps_max: int, control_hz: float
+    names: Sequence[str], robots: Sequence[str], steps_max: int, control_hz: float
 ) -> dict[str, RobosuiteTask]:
     """Every named task with every named robot; InvalidPlacement for an unknown name.
 
@@ -66,7 +68,7 @@ def offered(
 
     bridge = tasks.load()
     own = {name: _bridge(bridge[name]) for name in names if name in bridge}
-    names, robots = [name for name in names if name not in own], list(robots)
+    names = [name for name in names if name not in own]
     for kind, given, known in (
         ("task", names, {*robosuite.ALL_ENVIRONMENTS, *bridge}),
         ("robot", [one for some in robots for one in some.split("+")], robosuite.ALL_ROBOTS),
@@ -199,24 +201,28 @@ class RobosuiteWorld:
     def reset(self, *, configuration: int | None, seed: int) -> Observation:
         """The same seed gives the same bytes: robosuite's generators are set again in place."""
         environment = self._environment
-        self._steps, self._ever_success = 0, False
-        if self.task.is_bridge:
-            self._make_current()
-            return self._observe(environment.begin(configuration, seed))
-        if configuration is not None:
-            raise InvalidPlacement(
-                f"configuration {configuration}: expected 0 <= configuration < 0 "
-                f"for task {self.task.name}"
-            )
+        check_configuration(self.task.name, configuration, len(self.task.configurations))
         self._make_current()
+        if self.task.is_bridge:
+            observation = environment.begin(configuration, seed)
+        else:
+            self._seed(seed)
+            observation = environment.reset()
+        self._steps, self._ever_success = 0, False
+        return self._observe(observation)
+
+    def _seed(self, seed: int) -> None:
         # 1.5.2 ignores the seed that its Gymnasium wrapper is given; the placement sampler keeps
         # the generator object, so that its state is what must be replaced.
-        environment.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
+        state = np.random.default_rng(seed).bit_generator.state
+        self._environment.rng.bit_generator.state = state
         np.random.seed(seed % 2**32)
-        return self._observe(environment.reset())
 
     def step(self, action: NDArray[np.float64]) -> Transition:
-        """action: float64 (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open)."""
+        """action: float64, as the task describes; of one arm (7,): dx dy dz (m), rotation vector
+
+        (rad), gripper (+1 open).
+        """
         steps = self._running()
         if steps >= self.task.steps_max:
             raise InvalidAction(f"step {steps + 1}: expected at most {self.task.steps_max}")
@@ -251,17 +257,7 @@ class RobosuiteWorld:
             return statistics
         is_success = bool(self._environment._check_success())
         self._ever_success |= is_success
-        return Statistics(
-            is_success=is_success,
-            is_grasped=False,
-            ever_grasped=False,
-            consecutive_grasp=False,
-            moved_correct_object=False,
-            moved_wrong_object=False,
-            source_on_target=is_success,
-            ever_success=self._ever_success,
-            released_success=False,
-        )
+        return success_alone(is_success, self._ever_success)
 
     def save(self) -> Any:
         """All of MuJoCo's data, and the plain values of everything that robosuite keeps beside it.

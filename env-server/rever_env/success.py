@@ -37,6 +37,21 @@ class Touch:
     elsewhere: bool
 
 
+def success_alone(is_success: bool, ever_success: bool) -> Statistics:
+    """Statistics of worlds that know nothing else of an episode."""
+    return Statistics(
+        is_success=is_success,
+        is_grasped=False,
+        ever_grasped=False,
+        consecutive_grasp=False,
+        moved_correct_object=False,
+        moved_wrong_object=False,
+        source_on_target=is_success,
+        ever_success=ever_success,
+        released_success=False,
+    )
+
+
 class Judge:
     """Reads contacts and poses and says what the episode has come to."""
 

@@ -12,7 +12,7 @@ use crate::limits::{OUTCOME_BYTES_MAX, SEED_END};
 pub struct EpisodeOutcome {
     /// The run that the episode belongs to.
     pub run: String,
-    /// SIMPLER's name.
+    /// Its name in the server's description.
     pub task: String,
     /// `default`, or what is changed.
     pub variant: String,

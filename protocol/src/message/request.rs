@@ -9,7 +9,7 @@ use crate::limits::{ACTION_DIMENSIONS_MAX, REQUEST_BYTES_MAX, SEED_END, SLOTS_MA
 /// Everything that decides an episode's start.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Reset {
-    /// SIMPLER's name.
+    /// Its name in the server's description.
     pub task: String,
     /// `default`, or what is changed.
     pub variant: String,
@@ -29,7 +29,7 @@ pub enum Request {
     Reset {
         /// This request's number.
         sequence: u64,
-        /// SIMPLER's name.
+        /// Its name in the server's description.
         task: String,
         /// `default`, or what is changed.
         variant: String,
