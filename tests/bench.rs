@@ -81,3 +81,10 @@ fn a_python_without_pytorch_is_refused_in_words() {
         assert!(text.contains(words), "{text}");
     }
 }
+
+#[test]
+fn a_device_that_is_not_there_is_refused_in_words() {
+    let output = run(rever().args(["bench", "decision", "--device", "gpu"]));
+    assert_eq!(output.status.code(), Some(2), "{}", text(&output));
+    assert!(text(&output).contains("expected cpu, cuda or cuda:N, got gpu"), "{}", text(&output));
+}

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use agent::policy::Policy;
+use agent::policy::{DeviceName, Policy};
 use agent::training::{LabelledEpisode, TrainingSet, train};
 use agent::verifier::{Options, Verifier};
 use agent::wire::{Network, NetworkOptions, VerifierPublisher};
@@ -16,7 +16,8 @@ const EPISODES: usize = 6;
 #[tokio::test(flavor = "multi_thread")]
 async fn a_published_verifier_is_taken_up_between_episodes() {
     let folder = tempfile::tempdir().expect("a folder");
-    let policy = Policy::load(&repository().join("agent/models/bridge-small")).expect("a policy");
+    let model = repository().join("agent/models/bridge-small");
+    let policy = Policy::load(&model, DeviceName::Cpu).expect("a policy");
     let (first, second) = (verifier(&policy, 1), verifier(&policy, 2));
     let path = folder.path().join("first.safetensors");
     std::fs::write(&path, first.bytes()).expect("the first verifier is written");

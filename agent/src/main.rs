@@ -6,6 +6,8 @@ use agent::command::Program;
 use clap::Parser;
 
 fn main() -> ExitCode {
+    // SAFETY: nothing else runs yet that could read the environment.
+    unsafe { protocol::transport::share_threads() };
     // Wrong usage ends inside `parse`, with status 2 and a message that says what was expected.
     let program = Program::parse();
     #[expect(clippy::disallowed_methods, reason = "this is main")]

@@ -20,6 +20,16 @@ _FINISH_SECS_MAX = 10.0  # a wedged simulation is given up after that
 _PARENT_POLL_SECS = 0.5
 _CONGESTION_MICROSECONDS = 60_000_000  # a slow reader holds a reply up; it does not cost the link
 
+# A reply with its picture is three of zenoh's batches or more: all of them fit into the queue at
+# once, where two, zenoh's own choice, stop the simulation until the first one is gone.
+_QUEUED_BATCHES = 16
+# One pool of threads for all that zenoh does, so that a message is not handed from one thread to
+# another between the socket and the callback.
+_ZENOH_RUNTIME = (
+    "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), "
+    "app: (worker_threads: 4))"
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments of serve."""
@@ -113,6 +123,7 @@ class Endpoints:
         """zenoh's configuration in JSON."""
         link = {"rx": {"max_message_size": limits.MESSAGE_BYTES_MAX + 65_536}}
         wait = {"wait_before_close": _CONGESTION_MICROSECONDS}
+        queue = {"congestion_control": {"block": wait}, "size": {"data": _QUEUED_BATCHES}}
         # Left out, this is a free port on every interface: what others find by multicast.
         by_multicast = self.multicast and not self.listen
         listen = {} if by_multicast else {"listen": {"endpoints": self.listen}}
@@ -132,7 +143,7 @@ class Endpoints:
                     "gossip": {"enabled": self.multicast},
                 },
                 "transport": {
-                    "link": {**link, "tx": {"queue": {"congestion_control": {"block": wait}}}},
+                    "link": {**link, "tx": {"queue": queue}},
                     "shared_memory": {"enabled": False},
                 },
             }
@@ -149,6 +160,7 @@ def serve(arguments: argparse.Namespace) -> int:
         print("error: expected --connect, --listen or --multicast, got none", file=sys.stderr)
         return 2
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    os.environ.setdefault("ZENOH_RUNTIME", _ZENOH_RUNTIME)  # read when zenoh is first used
     endpoints = Endpoints(tuple(arguments.connect), tuple(arguments.listen), arguments.multicast)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

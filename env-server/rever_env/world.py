@@ -212,8 +212,10 @@ class World:
         self.data.ctrl[self._fingers] = opening
         control = self.data.ctrl[self._arm]  # a view
         start = control.copy()
+        way = target - start
         for share in self._ramp:
-            control[:] = start + (target - start) * share
+            np.multiply(way, share, out=control)
+            control += start
             mujoco.mj_step(self.model, self.data)
         control[:] = target
         mujoco.mj_step(self.model, self.data, settings.substeps - len(self._ramp))

@@ -81,7 +81,7 @@ pub fn parse<M: Message>(bytes: &[u8]) -> Result<(M, Option<CodecError>), CodecE
     let shape_came = structure::check(bytes).map_err(malformed)?;
     M::recognise(bytes).map_err(|reason| CodecError::Invalid { message: M::NAME, reason })?;
     let message: M = rmp_serde::from_slice(bytes).map_err(|error| malformed(words(error)))?;
-    let meant = shape(&message).map_err(malformed)?;
+    let meant = shape(&message, bytes.len()).map_err(malformed)?;
     if shape_came != meant {
         return Err(malformed(format!("expected the shape {meant}, got {shape_came}")));
     }
@@ -105,7 +105,9 @@ fn words(error: rmp_serde::decode::Error) -> String {
     }
 }
 
-fn shape<M: Message>(message: &M) -> Result<structure::Shape, String> {
-    let bytes = rmp_serde::to_vec_named(message).map_err(|error| error.to_string())?;
+/// The shape of `message` as it is written, in about `expected` bytes: a picture is not moved while it grows.
+fn shape<M: Message>(message: &M, expected: usize) -> Result<structure::Shape, String> {
+    let mut bytes = Vec::with_capacity(expected);
+    rmp_serde::encode::write_named(&mut bytes, message).map_err(|error| error.to_string())?;
     structure::check(&bytes)
 }

@@ -48,7 +48,7 @@ pub struct Row {
     pub tokens_per_second: f64,
     /// Bytes of weights that a step reads.
     pub weight_bytes: usize,
-    /// Of the bandwidth at which this machine reads as many bytes.
+    /// Of the bandwidth at which this machine's processors read as many bytes.
     pub bandwidth_share: f64,
 }
 
@@ -277,13 +277,14 @@ fn sampled(candidates: usize) -> Setting {
 mod tests {
     use super::*;
     use crate::bench::read_observations;
+    use crate::policy::DeviceName;
     use std::path::Path;
 
     #[test]
     fn every_setting_is_timed_on_every_observation() {
         let agent = Path::new(env!("CARGO_MANIFEST_DIR"));
         let model = agent.join("models/bridge-small");
-        let policy = Policy::load(&model).expect("the shipped policy");
+        let policy = Policy::load(&model, DeviceName::Cpu).expect("the shipped policy");
         let file = model.join("verifier.safetensors");
         let verifier = Verifier::load(&file, policy.digest()).expect("the shipped verifier");
         let observations =

@@ -12,7 +12,7 @@ use super::episodes::policy_folder;
 use crate::bench::{
     DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench, read_observations,
 };
-use crate::policy::Policy;
+use crate::policy::{DeviceName, Policy};
 use crate::setup;
 use crate::simulator::Simulator;
 use crate::site::Site;
@@ -39,6 +39,9 @@ struct DecisionArguments {
     /// The checkpoint's folder [default: the one that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
+    /// Where the policy computes: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    device: DeviceName,
     /// The verifier's file [default: the one beside the policy's weights]
     #[arg(long)]
     verifier: Option<PathBuf>,
@@ -81,6 +84,9 @@ struct ThroughputArguments {
     /// The checkpoint's folder, with its verifier [default: the one that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
+    /// Where the policy computes: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    device: DeviceName,
     /// A Python that has the packages of env-server, instead of the one that rever sets up
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
@@ -220,7 +226,7 @@ fn site(servers: usize, simulator: Simulator, python: Option<PathBuf>) -> Site {
 
 fn throughput(arguments: ThroughputArguments) -> Result<()> {
     let folder = policy_folder(arguments.policy.as_ref())?;
-    let policy = Policy::load(&folder)?;
+    let policy = Policy::load(&folder, arguments.device)?;
     let verifier = Verifier::load(&folder.join("verifier.safetensors"), policy.digest())?;
     let site = site(usize::from(arguments.servers), arguments.simulator, arguments.python);
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
@@ -263,9 +269,14 @@ fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
 }
 
 fn decision(arguments: DecisionArguments) -> Result<()> {
+    ensure!(
+        !arguments.compare || arguments.device == DeviceName::Cpu,
+        "--compare: expected --device cpu, where PyTorch runs, got {}",
+        arguments.device
+    );
     let folder = policy_folder(arguments.policy.as_ref())?;
     let file = arguments.verifier.unwrap_or_else(|| folder.join("verifier.safetensors"));
-    let policy = Policy::load(&folder)?;
+    let policy = Policy::load(&folder, arguments.device)?;
     let verifier = Verifier::load(&file, policy.digest())?;
     let recorded = match arguments.observations {
         Some(file) => file,

@@ -9,6 +9,7 @@ use clap::Args;
 use super::episodes::policy_folder;
 use super::report;
 use crate::campaign::Campaign;
+use crate::policy::DeviceName;
 use crate::result_file::ResultFile;
 use crate::rollout::Keep;
 use crate::site::Site;
@@ -82,6 +83,7 @@ fn campaign(arguments: &Arguments) -> Result<Campaign> {
         arms: vec![arm(Strategy::Sample), arm(Strategy::Verifier)],
         verifier: Some(policy.join("verifier.safetensors")),
         policy,
+        device: DeviceName::Cpu,
         follow_verifier: None,
         site: Site {
             servers: SERVERS,

@@ -9,7 +9,7 @@ use protocol::{Open, PROTOCOL_VERSION, Reset};
 use serde::Serialize;
 
 use super::episodes::policy_folder;
-use crate::policy::{Image, Policy, ProposalRequest};
+use crate::policy::{DeviceName, Image, Policy, ProposalRequest};
 use crate::setup::{self, PythonEnvironment};
 use crate::simulator::{ServerProgram, Simulator};
 use crate::site::Site;
@@ -141,7 +141,7 @@ fn check_rendering(python: &PythonEnvironment) -> Result<((), String)> {
 
 fn check_policy(folder: &Path) -> Result<(Policy, String)> {
     let begun = Instant::now();
-    let policy = Policy::load(folder)?;
+    let policy = Policy::load(folder, DeviceName::Cpu)?;
     let (height, width) = policy.image_size();
     let text = format!(
         "{} loaded in {} ms: digest {}, images {height} x {width}, hidden state {}",

@@ -6,6 +6,7 @@ use anyhow::Result;
 use clap::Args;
 
 use crate::campaign::Campaign;
+use crate::policy::DeviceName;
 use crate::rollout::Keep;
 use crate::setup;
 use crate::simulator::Simulator;
@@ -27,6 +28,9 @@ pub struct EpisodesArguments {
     /// The checkpoint's folder [default: the one that comes with rever].
     #[arg(long)]
     pub policy: Option<PathBuf>,
+    /// Where the policy computes: cpu, cuda or cuda:N.
+    #[arg(long, default_value_t)]
+    pub device: DeviceName,
     /// The verifier's file [default: the one beside the policy's weights, if there is one].
     #[arg(long)]
     pub verifier: Option<PathBuf>,
@@ -79,6 +83,7 @@ impl EpisodesArguments {
             suite,
             arms,
             policy,
+            device: self.device,
             // Whoever follows a verifier starts with a named one or with the first that is published.
             verifier: if self.follow_verifier.is_some() { self.verifier.clone() } else { verifier },
             follow_verifier: self.follow_verifier.clone(),

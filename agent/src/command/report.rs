@@ -7,7 +7,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::episodes::policy_folder;
-use crate::policy::Policy;
+use crate::policy::{DeviceName, Policy};
 use crate::report::{self, Report, ReportOptions, Speech};
 use crate::run;
 
@@ -51,7 +51,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
 /// Builds the report of a run with the policy that made it.
 pub fn build(run: &Path, out: &Path, policy: &Path, episodes_max: usize) -> Result<Report> {
     let header = run::read_header(run)?;
-    let policy = Policy::load(policy)?;
+    let policy = Policy::load(policy, DeviceName::Cpu)?;
     let (expected, found) = (header.versions["policy"].as_str(), policy.digest());
     ensure!(
         expected == Some(found),

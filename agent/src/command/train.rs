@@ -8,7 +8,7 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use serde::Serialize;
 
-use crate::policy::Policy;
+use crate::policy::{DeviceName, Policy};
 use crate::record::write_whole;
 use crate::table::aligned;
 use crate::training::records::{self, Reader};
@@ -93,7 +93,7 @@ struct ResultFile<'a> {
 /// Trains, prints, writes, publishes.
 pub fn run(arguments: Arguments) -> Result<()> {
     let started = Instant::now();
-    let policy = Policy::load(&arguments.policy)?;
+    let policy = Policy::load(&arguments.policy, DeviceName::Cpu)?;
     let action_scale = policy.action_scale();
     let confidence =
         |tokens: &[u32], log_probabilities: &[f32]| policy.confidence(tokens, log_probabilities);

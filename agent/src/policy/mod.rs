@@ -33,6 +33,7 @@ mod vision;
 mod activation;
 mod attention;
 pub mod backend;
+mod device;
 mod linear;
 mod matmul;
 mod norm;
@@ -56,6 +57,7 @@ mod timings;
 pub use backend::Backend;
 pub use candidate::{Candidate, Parsed, Proposal, ProposalRequest};
 pub use confidence::{Confidence, PARTS};
+pub use device::DeviceName;
 pub use protocol::message::Image;
 pub use reasoning::{Malformed, Reasoning, VisibleObject};
 pub use timings::Timings;
@@ -81,8 +83,9 @@ pub struct Policy {
 
 impl Policy {
     /// Loads a checkpoint's folder: config.json, model.safetensors (or shards), tokenizer.json.
-    pub fn load(directory: &Path) -> Result<Policy> {
-        Policy::load_on(directory, &Device::Cpu, Backend::for_device(&Device::Cpu))
+    pub fn load(directory: &Path, device: DeviceName) -> Result<Policy> {
+        let device = device.open()?;
+        Policy::load_on(directory, &device, Backend::for_device(&device))
     }
 
     /// Loads a checkpoint onto a device, computing as told.

@@ -34,7 +34,8 @@ fn measure_inside(
 ) -> Result<Timings> {
     let start = Instant::now();
     let (prefix, hidden) = network.prefill_all(contexts)?;
-    network.decoder.logits(&hidden)?;
+    // A graphics card works on after the call has returned.
+    network.decoder.logits(&hidden)?.device().synchronize()?;
     let prefill_ms = start.elapsed().as_secs_f64() * 1e3;
     let sessions: Vec<usize> =
         (0..contexts.len() * candidates).map(|row| row / candidates).collect();
@@ -43,7 +44,7 @@ fn measure_inside(
     let mut tail = network.decoder.tails(sessions, tokens);
     for _ in 0..tokens {
         let hidden = network.decoder.step(&ids, &prefix, &mut tail)?;
-        network.decoder.logits(&hidden)?;
+        network.decoder.logits(&hidden)?.device().synchronize()?;
     }
     let step_ms = start.elapsed().as_secs_f64() * 1e3 / tokens as f64;
     Ok(Timings { prefill_ms, step_ms })

@@ -44,6 +44,19 @@ struct Display {
     display: egl::Display,
 }
 
+/// Mesa's software renderer draws in the thread that asks: handing a small picture to threads of its own takes as long
+/// as drawing it, and servers share a machine by processes. Call it first of all.
+///
+/// # Safety
+/// No other thread may run: one that reads the environment meanwhile is undefined behaviour.
+pub unsafe fn draw_in_this_thread() {
+    const THREADS: &str = "LP_NUM_THREADS";
+    if std::env::var_os(THREADS).is_none() {
+        // SAFETY: as the caller has promised.
+        unsafe { std::env::set_var(THREADS, "0") };
+    }
+}
+
 impl Camera {
     pub fn new(
         model: &Arc<MjModel>,

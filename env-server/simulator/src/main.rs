@@ -46,6 +46,11 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    // SAFETY: nothing else runs yet that could read the environment.
+    unsafe {
+        protocol::transport::share_threads();
+        camera::draw_in_this_thread();
+    }
     let program = Program::parse();
     tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).init();
     match run(program) {

@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow, ensure};
+use bytes::Bytes;
 use protocol::{
     Description, Heartbeat, Keys, Open, Opening, PROTOCOL_VERSION, Request, TaskDescription, codec,
     decode, encode, limits,
@@ -361,7 +362,7 @@ fn locked(signs: &Mutex<Signs>) -> MutexGuard<'_, Signs> {
 }
 
 /// A reply that cannot be sent is asked for again, or its holder is gone.
-fn publish(publisher: &Publisher<'_>, bytes: Vec<u8>) {
+fn publish(publisher: &Publisher<'_>, bytes: Bytes) {
     if let Err(error) = publisher.put(bytes).wait() {
         tracing::warn!("a reply was not sent: {error}");
     }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use bytes::Bytes;
 use protocol::{CodecError, FaultKind, Observation, Open, Reply, Request, encode, limits};
 
 use crate::fault::Fault;
@@ -16,7 +17,7 @@ pub struct Session {
     pub closed: bool,
     opened: Open,
     last_sequence: u64,
-    last_reply: Vec<u8>,
+    last_reply: Bytes,
     is_running: bool,
     slots: BTreeMap<u32, Snapshot>,
     world: Option<(Key, World)>,
@@ -32,7 +33,7 @@ impl Session {
             closed: false,
             opened,
             last_sequence: 0,
-            last_reply: Vec::new(),
+            last_reply: Bytes::new(),
             is_running: false,
             slots: BTreeMap::new(),
             world: Some((key, world)),
@@ -40,7 +41,7 @@ impl Session {
     }
 
     /// The reply's bytes; none when the request is older than the last one.
-    pub fn answer(&mut self, bytes: &[u8], worlds: &mut Worlds) -> Option<Vec<u8>> {
+    pub fn answer(&mut self, bytes: &[u8], worlds: &mut Worlds) -> Option<Bytes> {
         let (request, refusal) = match protocol::codec::parse::<Request>(bytes) {
             Ok((request, invalid)) => (request, invalid),
             Err(error) => return Some(refused(0, &error.to_string())),
@@ -67,7 +68,7 @@ impl Session {
             None => self.perform(request, worlds),
         };
         self.last_sequence = sequence;
-        self.last_reply.clone_from(&reply);
+        self.last_reply = reply.clone();
         Some(reply)
     }
 
@@ -79,13 +80,13 @@ impl Session {
         self.release(worlds);
     }
 
-    fn perform(&mut self, request: Request, worlds: &mut Worlds) -> Vec<u8> {
+    fn perform(&mut self, request: Request, worlds: &mut Worlds) -> Bytes {
         let sequence = request.sequence();
         let reply = self.reply(request, worlds).and_then(|reply| {
             encode(&reply).map_err(|error| Fault::Internal(format!("CodecError: {error}")))
         });
         match reply {
-            Ok(bytes) => bytes,
+            Ok(bytes) => bytes.into(),
             Err(fault) => match fault.kind() {
                 None => refused(sequence, &fault.to_string()),
                 Some(kind) => self.faulted(sequence, kind, &fault.to_string()),
@@ -160,7 +161,7 @@ impl Session {
     }
 
     /// The world may be broken for good: the next Reset gets another one.
-    fn faulted(&mut self, sequence: u64, kind: FaultKind, reason: &str) -> Vec<u8> {
+    fn faulted(&mut self, sequence: u64, kind: FaultKind, reason: &str) -> Bytes {
         self.is_running = false;
         self.slots.clear();
         self.world = None;
@@ -184,12 +185,12 @@ impl Session {
 }
 
 /// The bytes of a refusal.
-pub fn refused(sequence: u64, reason: &str) -> Vec<u8> {
+pub fn refused(sequence: u64, reason: &str) -> Bytes {
     written(&Reply::Refused { sequence, reason: short(reason) })
 }
 
-fn written(reply: &Reply) -> Vec<u8> {
-    encode(reply).expect("a reason within its limit can be written")
+fn written(reply: &Reply) -> Bytes {
+    encode(reply).expect("a reason within its limit can be written").into()
 }
 
 fn words(error: Option<CodecError>) -> String {

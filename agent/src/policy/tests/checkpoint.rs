@@ -23,7 +23,7 @@ fn load_changed(
     config(&mut value);
     std::fs::write(directory.path().join("config.json"), value.to_string())?;
     std::fs::copy(source.join("tokenizer.json"), directory.path().join("tokenizer.json"))?;
-    Policy::load(directory.path())
+    Policy::load(directory.path(), DeviceName::Cpu)
 }
 
 fn refusal(policy: Result<Policy>) -> String {

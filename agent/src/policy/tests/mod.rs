@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result};
 use candle_core::{DType, Device, Tensor};
 
-use super::{Backend, Image, Policy};
+use super::{Backend, DeviceName, Image, Policy};
 
 /// Both tiny layouts: one tower as the shipped model has, two as OpenVLA-7B has.
 const TINY: [&str; 2] = ["tiny", "tiny-fused"];
