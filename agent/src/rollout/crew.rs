@@ -228,6 +228,53 @@ fn unfit(server: &ServerDescription, job: &Job) -> Option<String> {
     })
 }
 
+/// What a run's episodes must have in common: a task of another version has other results.
 fn simulator(server: &ServerDescription) -> String {
-    format!("{} {}", server.simulator, server.simulator_version)
+    let name = format!("{} {}", server.simulator, server.simulator_version);
+    let versions: BTreeSet<u32> = server.tasks.iter().map(|task| task.version).collect();
+    // Left out where every task is its first version, as in runs from before there was a second.
+    if versions.iter().all(|&version| version == 1) {
+        return name;
+    }
+    let versions: Vec<String> = versions.iter().map(u32::to_string).collect();
+    format!("{name}, task version {}", versions.join(" and "))
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::TaskDescription;
+
+    use super::*;
+
+    fn server(versions: &[u32]) -> ServerDescription {
+        let task = |&version: &u32| TaskDescription {
+            task: format!("task {version}"),
+            variant: "default".to_owned(),
+            version,
+            instruction: String::new(),
+            steps_max: 1,
+            configurations: 0,
+            state: Vec::new(),
+            action: Vec::new(),
+        };
+        ServerDescription {
+            protocol: PROTOCOL_VERSION,
+            server: "some".to_owned(),
+            simulator: "world".to_owned(),
+            simulator_version: "3".to_owned(),
+            tasks: versions.iter().map(task).collect(),
+            image_side_max: 0,
+            sessions: 0,
+            sessions_max: 1,
+            slots_max: 1,
+            idle_secs_max: 1,
+        }
+    }
+
+    #[test]
+    fn another_version_of_a_task_is_another_simulator() {
+        assert_eq!(simulator(&server(&[1, 1])), "world 3");
+        assert_eq!(simulator(&server(&[2, 2])), "world 3, task version 2");
+        assert_eq!(simulator(&server(&[2, 1])), "world 3, task version 1 and 2");
+    }
 }
