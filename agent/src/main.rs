@@ -6,8 +6,11 @@ use agent::command::Program;
 use clap::Parser;
 
 fn main() -> ExitCode {
-    // SAFETY: nothing else runs yet that could read the environment.
-    unsafe { protocol::transport::share_threads() };
+    let (name, value) = protocol::transport::RUNTIME;
+    if std::env::var_os(name).is_none() {
+        // SAFETY: no other thread runs yet that could read the environment.
+        unsafe { std::env::set_var(name, value) };
+    }
     // Wrong usage ends inside `parse`, with status 2 and a message that says what was expected.
     let program = Program::parse();
     #[expect(clippy::disallowed_methods, reason = "this is main")]

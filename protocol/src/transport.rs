@@ -2,10 +2,12 @@
 
 use crate::limits::MESSAGE_BYTES_MAX;
 
-/// zenoh's own threads, which it takes from the environment alone: one pool for all that it does.
-const RUNTIME_KEY: &str = "ZENOH_RUNTIME";
-const RUNTIME: &str = "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), \
-                       app: (worker_threads: 4))";
+/// A variable of the environment, from which alone zenoh takes its threads, and its value: one pool for all that zenoh does,
+/// so that no message is handed from one thread to another between the socket and the callback. To be set before zenoh is used.
+pub const RUNTIME: (&str, &str) = (
+    "ZENOH_RUNTIME",
+    "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), app: (worker_threads: 4))",
+);
 /// A slow reader holds a message up that long before the link is given up.
 const CONGESTION_MICROSECONDS: u64 = 60_000_000;
 /// A reply with its picture is three of zenoh's batches or more: all of them fit into the queue at once, where two, zenoh's
@@ -13,18 +15,6 @@ const CONGESTION_MICROSECONDS: u64 = 60_000_000;
 const QUEUED_BATCHES: usize = 16;
 /// What zenoh adds to a body.
 const ENVELOPE_BYTES: usize = 65_536;
-
-/// Lets zenoh do everything in one pool of threads, so that no message is handed from one to another between the socket
-/// and the callback, unless the environment says otherwise. Call it first of all.
-///
-/// # Safety
-/// No other thread may run: one that reads the environment meanwhile is undefined behaviour.
-pub unsafe fn share_threads() {
-    if std::env::var_os(RUNTIME_KEY).is_none() {
-        // SAFETY: as the caller has promised.
-        unsafe { std::env::set_var(RUNTIME_KEY, RUNTIME) };
-    }
-}
 
 /// Entries of zenoh's configuration as key and JSON value. `client_wait_ms`: how long a client waits for the router or
 /// server that it is told to connect to.

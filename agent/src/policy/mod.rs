@@ -82,13 +82,13 @@ pub struct Policy {
 }
 
 impl Policy {
-    /// Loads a checkpoint's folder: config.json, model.safetensors (or shards), tokenizer.json.
+    /// Loads a checkpoint's folder onto a device: config.json, model.safetensors (or shards), tokenizer.json.
     pub fn load(directory: &Path, device: DeviceName) -> Result<Policy> {
         let device = device.open()?;
         Policy::load_on(directory, &device, Backend::for_device(&device))
     }
 
-    /// Loads a checkpoint onto a device, computing as told.
+    /// Loads it onto an open device, computing as told.
     pub fn load_on(directory: &Path, device: &Device, backend: Backend) -> Result<Policy> {
         let load = || -> Result<Policy> {
             let config = Config::load(&directory.join("config.json"))?;

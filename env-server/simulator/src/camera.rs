@@ -13,6 +13,9 @@ use crate::fault::Fault;
 
 type Egl = egl::DynamicInstance<egl::EGL1_5>;
 
+/// A variable of the environment and its value: Mesa's software renderer draws in the thread that asks. Handing a small
+/// picture to threads of its own takes as long as drawing it, and servers share a machine by processes.
+pub const DRAWING_THREADS: (&str, &str) = ("LP_NUM_THREADS", "0");
 const GEOMS_MAX: usize = 200;
 /// Of EGL_EXT_platform_device: a display of a graphics device, without a window system.
 const PLATFORM_DEVICE: egl::Enum = 0x313F;
@@ -42,19 +45,6 @@ struct Offscreen {
 struct Display {
     egl: Egl,
     display: egl::Display,
-}
-
-/// Mesa's software renderer draws in the thread that asks: handing a small picture to threads of its own takes as long
-/// as drawing it, and servers share a machine by processes. Call it first of all.
-///
-/// # Safety
-/// No other thread may run: one that reads the environment meanwhile is undefined behaviour.
-pub unsafe fn draw_in_this_thread() {
-    const THREADS: &str = "LP_NUM_THREADS";
-    if std::env::var_os(THREADS).is_none() {
-        // SAFETY: as the caller has promised.
-        unsafe { std::env::set_var(THREADS, "0") };
-    }
 }
 
 impl Camera {

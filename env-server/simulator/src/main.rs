@@ -46,10 +46,11 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    // SAFETY: nothing else runs yet that could read the environment.
-    unsafe {
-        protocol::transport::share_threads();
-        camera::draw_in_this_thread();
+    for (name, value) in [protocol::transport::RUNTIME, camera::DRAWING_THREADS] {
+        if std::env::var_os(name).is_none() {
+            // SAFETY: no other thread runs yet that could read the environment.
+            unsafe { std::env::set_var(name, value) };
+        }
     }
     let program = Program::parse();
     tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).init();
