@@ -112,8 +112,10 @@ class _Blocks:
         self._world = world
         self._substeps = world.task.settings.substeps
         self._camera = world.task.settings.camera
-        self._spare = mujoco.MjData(world.model)
-        self._renderer = mujoco.Renderer(world.model, side, side)
+        # A model of its own: the camera hides shapes of the world's.
+        self._model = mujoco.MjModel.from_xml_path(str(world.task.scene))
+        self._spare = mujoco.MjData(self._model)
+        self._renderer = mujoco.Renderer(self._model, side, side)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._renderer.scene.flags[flag] = 0
         self._seed = 0
@@ -139,7 +141,7 @@ class _Blocks:
 
     def bare(self) -> list[float]:
         """The same physics and the same picture by MuJoCo's own calls."""
-        model, data = self._world.model, self._spare
+        model, data = self._model, self._spare
         seconds = []
         for state, control in self._states:
             mujoco.mj_setState(model, data, state, _STATE)

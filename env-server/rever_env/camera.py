@@ -12,6 +12,8 @@ from rever_env.fault import RendererUnavailable
 
 Image = NDArray[np.uint8]
 _GEOMS_MAX = 200
+_HIDDEN_GROUP = 5  # of shapes; MuJoCo draws the groups 0 to 2
+_EDGE_MARGIN = 1e-3  # metres, for what is rounded on the way to a pixel
 
 
 class Camera:
@@ -49,6 +51,10 @@ class Camera:
             self._scene.flags[flag] = 0
         self._option = mujoco.MjvOption()
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._groups = model.geom_group.copy()
+        self._edges = _edges(model, self._view.fixedcamid)
+        radii = model.geom_rbound[:, np.newaxis]  # (shapes, 1); 0: without end
+        self._radii = np.where(radii > 0.0, radii + _EDGE_MARGIN, np.inf)
 
     def image(self, data: mujoco.MjData) -> Image:
         """RGB, uint8 (height, width, 3)."""
@@ -104,6 +110,7 @@ class Camera:
     def _update(self, data: mujoco.MjData) -> None:
         # Several worlds may live in one process: each makes its own context current first.
         self._context.make_current()
+        self._hide(data)
         mujoco.mjv_updateScene(
             self._model,
             data,
@@ -114,11 +121,38 @@ class Camera:
             self._scene,
         )
 
+    def _hide(self, data: mujoco.MjData) -> None:
+        """Takes shapes beyond the picture's edges out: no pixel changes, and OpenGL's work does."""
+        index = self._view.fixedcamid
+        normals = data.cam_xmat[index].reshape(3, 3) @ self._edges
+        beyond = (data.geom_xpos - data.cam_xpos[index]) @ normals  # (shapes, 5), metres
+        outside = (beyond > self._radii).any(axis=1)
+        self._model.geom_group[:] = np.where(outside, _HIDDEN_GROUP, self._groups)
+
     def _read(self) -> Image:
         mujoco.mjr_render(self._rectangle, self._scene, self._renderer)
         image = np.empty((self._height, self._width, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(image, None, self._rectangle, self._renderer)
         return np.ascontiguousarray(image[::-1])  # OpenGL's rows start at the bottom
+
+
+def _edges(model: mujoco.MjModel, camera: int) -> NDArray[np.float64]:
+    """Unit normals that point out of what the camera sees, (3, 5) in its frame.
+
+    Right, left, top, bottom and behind; the camera looks along -z with y up.
+    """
+    right, top = model.cam_sensorsize[camera] / (2.0 * model.cam_intrinsic[camera][:2])
+    edges = np.array(
+        [
+            (1.0, 0.0, right),
+            (-1.0, 0.0, right),
+            (0.0, 1.0, top),
+            (0.0, -1.0, top),
+            (0.0, 0.0, 1.0),
+        ]
+    )
+    normals: NDArray[np.float64] = (edges / np.linalg.norm(edges, axis=1, keepdims=True)).T
+    return normals
 
 
 def _release(context: Any, renderer: mujoco.MjrContext) -> None:

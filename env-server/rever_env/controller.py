@@ -22,11 +22,19 @@ class Controller:
         self._scratch = mujoco.MjData(model)
         self._site = model.site(task.settings.tcp).id
         joints = [model.joint(name) for name in task.settings.arm_joints]
-        self._positions = np.array([joint.qposadr[0] for joint in joints])
-        self._dofs = np.array([joint.dofadr[0] for joint in joints])
+        self._positions = consecutive([joint.qposadr[0] for joint in joints])
+        self._dofs = consecutive([joint.dofadr[0] for joint in joints])
         self._lower = np.array([joint.range[0] for joint in joints])
         self._upper = np.array([joint.range[1] for joint in joints])
         self._base = model.body(task.settings.robot_body).id
+        damping = task.inverse_kinematics.damping
+        self._damping = damping * damping * np.eye(len(joints))
+        # Making an array costs more than filling it. The first three are views.
+        self._joints: Vector = self._scratch.qpos[self._positions]
+        self._site_position = self._scratch.site_xpos[self._site]
+        self._site_axes = self._scratch.site_xmat[self._site]
+        self._residual = np.zeros(6)
+        self._jacobian = np.zeros((6, model.nv))
         # The commanded pose, world frame: position in metres, unit quaternion wxyz.
         self.position: Vector = np.zeros(3)
         self.quaternion: Vector = np.array([1.0, 0.0, 0.0, 0.0])
@@ -69,41 +77,48 @@ class Controller:
     def _solve(self, data: mujoco.MjData) -> Vector:
         """Damped least squares from the measured joints; unreachable targets keep the measured."""
         settings = self._task.inverse_kinematics
-        scratch = self._scratch
+        scratch, joints, jacobian = self._scratch, self._joints, self._jacobian
         scratch.qpos[:] = data.qpos
-        jacobian = np.zeros((6, self._model.nv))
-        gram = np.zeros((6, 6))
-        solution = np.zeros(6)
-        step = np.zeros(6)
-        damping = settings.damping * settings.damping * np.eye(6)
+        arm_jacobian = np.empty((6, len(joints)))
+        gram = np.empty((6, 6))
+        solution, step = np.empty(6), np.empty(len(joints))
+        distance = self._miss()
         for _ in range(settings.iterations_max):
-            residual = self._residual()
-            if mujoco.mju_norm(residual) <= settings.tolerance:
+            if distance <= settings.tolerance:
                 break
             mujoco.mj_comPos(self._model, scratch)
             mujoco.mj_jacSite(self._model, scratch, jacobian[:3], jacobian[3:], self._site)
-            arm_jacobian = np.ascontiguousarray(jacobian[:, self._dofs])  # (6, 6)
+            arm_jacobian[:] = jacobian[:, self._dofs]
             mujoco.mju_mulMatMatT(gram, arm_jacobian, arm_jacobian)
-            gram += damping
+            gram += self._damping
             mujoco.mju_cholFactor(gram, 0.0)
-            mujoco.mju_cholSolve(solution, gram, residual)
+            mujoco.mju_cholSolve(solution, gram, self._residual)
             mujoco.mju_mulMatTVec(step, arm_jacobian, solution)
-            joints = scratch.qpos[self._positions] + step
-            scratch.qpos[self._positions] = np.clip(joints, self._lower, self._upper)
-        if mujoco.mju_norm(self._residual()) > settings.failure:
+            step += joints
+            np.maximum(step, self._lower, out=step)
+            np.minimum(step, self._upper, out=joints)
+            distance = self._miss()
+        if distance > settings.failure:
             scratch.qpos[:] = data.qpos
-        joints = np.array(scratch.qpos[self._positions])
-        return joints
+        return joints.copy()
 
-    def _residual(self) -> Vector:
-        """Commanded minus scratch pose, world frame: metres (3) and rotation vector in rad (3)."""
-        scratch = self._scratch
-        mujoco.mj_kinematics(self._model, scratch)
-        residual = np.zeros(6)
-        residual[:3] = self.position - scratch.site_xpos[self._site]
-        quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, scratch.site_xmat[self._site])
-        local = np.zeros(3)
+    def _miss(self) -> float:
+        """Norm of the residual, which is filled: commanded minus scratch pose in the world frame.
+
+        Metres (3) and rotation vector in rad (3).
+        """
+        residual = self._residual
+        mujoco.mj_kinematics(self._model, self._scratch)
+        np.subtract(self.position, self._site_position, out=residual[:3])
+        quaternion, local = np.empty(4), np.empty(3)
+        mujoco.mju_mat2Quat(quaternion, self._site_axes)
         mujoco.mju_subQuat(local, self.quaternion, quaternion)
         mujoco.mju_rotVecQuat(residual[3:], local, quaternion)
-        return residual
+        return float(mujoco.mju_norm(residual))
+
+
+def consecutive(indices: list[int]) -> slice:
+    """The slice of indices that follow one another: it gives a view where a list gives a copy."""
+    first, end = int(indices[0]), int(indices[-1]) + 1
+    assert indices == list(range(first, end)), f"expected {first} to {end - 1}, got {indices}"
+    return slice(first, end)

@@ -102,26 +102,33 @@ class Judge:
     def touch(self, data: mujoco.MjData) -> Touch:
         """Contacts of the source whose impulse per physics step is large enough to count."""
         fingers = (np.zeros(3), np.zeros(3))
-        robot = target = elsewhere = False
+        touched: set[str] = set()
         wrench = np.zeros(6)
         force = np.zeros(3)
-        pairs = self._model.geom_bodyid[data.contact.geom]  # (contacts, 2)
-        for index in np.flatnonzero((pairs == self._source).sum(axis=1) == 1).tolist():
-            bodies = pairs[index].tolist()
+        contacts = data.contact
+        frames = contacts.frame  # (contacts, 9)
+        pairs = self._model.geom_bodyid[contacts.geom].tolist()  # (contacts, 2)
+        for index, (first, second) in enumerate(pairs):
+            if (first == self._source) == (second == self._source):
+                continue
+            other = second if first == self._source else first
+            if self._is_robot[other]:
+                kind = "robot"
+            else:
+                kind = "target" if other == self._target else "elsewhere"
+            is_finger = other in self._fingers
+            if kind in touched and not is_finger:
+                continue  # what rests on the table touches it in many points, and one tells
             mujoco.mj_contactForce(self._model, data, index, wrench)
             if norm(wrench[:3]) * self._task.settings.timestep < self._task.grasp.impulse_min:
                 continue
-            other = bodies[1] if bodies[0] == self._source else bodies[0]
-            if other in self._fingers:
-                frame = data.contact.frame[index].reshape(3, 3)
-                mujoco.mju_mulMatTVec(force, frame, wrench[:3])
+            touched.add(kind)
+            if is_finger:
+                mujoco.mju_mulMatTVec(force, frames[index].reshape(3, 3), wrench[:3])
                 # The contact force acts on the second geom's body; flip it when that is the finger.
-                sign = 1.0 if bodies[1] == self._source else -1.0
+                sign = 1.0 if second == self._source else -1.0
                 fingers[self._fingers.index(other)][:] += sign * force
-            robot |= self._is_robot[other]
-            target |= other == self._target
-            elsewhere |= other != self._target and not self._is_robot[other]
-        return Touch(fingers, robot, target, elsewhere)
+        return Touch(fingers, "robot" in touched, "target" in touched, "elsewhere" in touched)
 
     def grasped(self, data: mujoco.MjData, touch: Touch) -> bool:
         """Both fingers press the source within 60 degrees of their closing direction."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rever_env import expert, snapshot
 from rever_env.camera import Camera
-from rever_env.controller import Controller
+from rever_env.controller import Controller, consecutive
 from rever_env.fault import (
     Fault,
     InvalidAction,
@@ -91,11 +91,9 @@ class World:
         self.memory: Memory | None = None
         self.steps = 0
         self.camera = Camera(self.model, task.settings.camera, image_height, image_width)
-        arm = [self.model.actuator(name).id for name in task.settings.arm_joints]
-        self._arm = slice(arm[0], arm[-1] + 1)
-        assert arm == list(range(arm[0], arm[-1] + 1)), "the arm's drives follow one another"
+        self._arm = consecutive([self.model.actuator(name).id for name in task.settings.arm_joints])
         ramp_steps = round(task.settings.ramp / task.settings.timestep)
-        self._ramp = [index / ramp_steps for index in range(1, ramp_steps + 1)]
+        self._ramp = np.arange(1, ramp_steps + 1) / ramp_steps
         self._fingers = [self.model.actuator(name).id for name in task.settings.finger_joints]
         self._finger_positions = [
             self.model.joint(name).qposadr[0] for name in task.settings.finger_joints
@@ -212,10 +210,8 @@ class World:
         self.data.ctrl[self._fingers] = opening
         control = self.data.ctrl[self._arm]  # a view
         start = control.copy()
-        way = target - start
-        for share in self._ramp:
-            np.multiply(way, share, out=control)
-            control += start
+        for passed in np.multiply.outer(self._ramp, target - start) + start:
+            control[:] = passed
             mujoco.mj_step(self.model, self.data)
         control[:] = target
         mujoco.mj_step(self.model, self.data, settings.substeps - len(self._ramp))

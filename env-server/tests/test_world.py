@@ -52,6 +52,22 @@ def test_the_same_reset_gives_the_same_bytes(world: World, task: Task) -> None:
         assert _bytes(other.reset(configuration=None, seed=11)) == first
 
 
+def test_what_lies_beyond_the_edges_is_left_out_and_changes_no_pixel(
+    world: World, task: Task
+) -> None:
+    model = mujoco.MjModel.from_xml_path(str(task.scene))
+    height, width = world.reset(configuration=1, seed=0).image.shape[:2]
+    with mujoco.Renderer(model, height, width) as whole:
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            whole.scene.flags[flag] = 0
+        for action in _actions(20):
+            image = world.step(action).observation.image
+            whole.update_scene(world.data, task.settings.camera)
+            np.testing.assert_array_equal(image, whole.render())
+            hidden = world.model.geom_group != model.geom_group
+            assert 3 <= np.count_nonzero(hidden) < np.count_nonzero(model.geom_group < 3) - 10
+
+
 def test_save_and_restore_are_exact(world: World, task: Task) -> None:
     world.reset(configuration=3, seed=0)
     _run(world, _actions(10))

@@ -17,6 +17,8 @@ type Egl = egl::DynamicInstance<egl::EGL1_5>;
 /// picture to threads of its own takes as long as drawing it, and servers share a machine by processes.
 pub const DRAWING_THREADS: (&str, &str) = ("LP_NUM_THREADS", "0");
 const GEOMS_MAX: usize = 200;
+/// Metres, for what is rounded on the way to a pixel.
+const EDGE_MARGIN: f32 = 1e-3;
 /// Of EGL_EXT_platform_device: a display of a graphics device, without a window system.
 const PLATFORM_DEVICE: egl::Enum = 0x313F;
 const DEVICES_MAX: usize = 16;
@@ -112,16 +114,57 @@ impl Renderer {
             return Err(Fault::RendererUnavailable("the renderer was freed".to_owned()));
         };
         self.scene.update(data, &self.option, &MjvPerturb::default(), &mut self.view);
+        keep_inside(&mut self.scene);
         self.scene.render(&self.rectangle, context);
         let (height, width) = (self.rectangle.height as usize, self.rectangle.width as usize);
-        let mut upwards = vec![0; height * width * 3];
+        let row = width * 3;
+        let mut upwards = vec![0; height * row];
         context
             .read_pixels(Some(&mut upwards), None, &self.rectangle)
             .map_err(|error| Fault::RendererUnavailable(error.to_string()))?;
         // OpenGL's rows start at the bottom.
-        let pixels = upwards.chunks_exact(width * 3).rev().flatten().copied().collect();
+        let mut pixels = Vec::with_capacity(upwards.len());
+        upwards.chunks_exact(row).rev().for_each(|line| pixels.extend_from_slice(line));
         Ok(Image { height, width, pixels })
     }
+}
+
+/// Takes shapes beyond the picture's edges out of the scene: no pixel changes, and OpenGL's work does.
+fn keep_inside(scene: &mut MjvScene) {
+    // SAFETY: shapes are only put into another order, and fewer counted.
+    let scene = unsafe { scene.ffi_mut() };
+    let camera = &scene.camera[0];
+    let (forward, up) = (camera.forward, camera.up);
+    let right = [
+        forward[1] * up[2] - forward[2] * up[1],
+        forward[2] * up[0] - forward[0] * up[2],
+        forward[0] * up[1] - forward[1] * up[0],
+    ];
+    let dot = |left: [f32; 3], right: [f32; 3]| -> f32 {
+        left.iter().zip(right).map(|(left, right)| left * right).sum()
+    };
+    // Half of the picture's width and height at the distance of 1 m.
+    let wide = camera.frustum_width / camera.frustum_near;
+    let high = camera.frustum_top / camera.frustum_near;
+    let is_outside = |geom: &mujoco_rs::mujoco_c::mjvGeom| {
+        let offset = std::array::from_fn(|axis| geom.pos[axis] - camera.pos[axis]);
+        let depth = dot(offset, forward);
+        let beyond = |across: f32, slope: f32| (across.abs() - slope * depth) / slope.hypot(1.0);
+        let beyond = [beyond(dot(offset, right), wide), beyond(dot(offset, up), high), -depth];
+        // A bounding radius of 0 stands for a shape without end.
+        let radius = geom.modelrbound;
+        radius > 0.0 && beyond.iter().any(|distance| *distance > radius + EDGE_MARGIN)
+    };
+    // SAFETY: MuJoCo has filled that many shapes, which nobody else uses now.
+    let geoms = unsafe { std::slice::from_raw_parts_mut(scene.geoms, scene.ngeom as usize) };
+    let mut kept = 0;
+    for index in 0..geoms.len() {
+        if !is_outside(&geoms[index]) {
+            geoms.swap(kept, index);
+            kept += 1;
+        }
+    }
+    scene.ngeom = kept as i32;
 }
 
 impl Drop for Renderer {
