@@ -51,6 +51,7 @@ class Camera:
             self._scene.flags[flag] = 0
         self._option = mujoco.MjvOption()
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._upwards = np.empty((height, width, 3), dtype=np.uint8)
         self._groups = model.geom_group.copy()
         self._edges = _edges(model, self._view.fixedcamid)
         radii = model.geom_rbound[:, np.newaxis]  # (shapes, 1); 0: without end
@@ -131,9 +132,9 @@ class Camera:
 
     def _read(self) -> Image:
         mujoco.mjr_render(self._rectangle, self._scene, self._renderer)
-        image = np.empty((self._height, self._width, 3), dtype=np.uint8)
-        mujoco.mjr_readPixels(image, None, self._rectangle, self._renderer)
-        return np.ascontiguousarray(image[::-1])  # OpenGL's rows start at the bottom
+        mujoco.mjr_readPixels(self._upwards, None, self._rectangle, self._renderer)
+        image: Image = self._upwards[::-1].copy()  # OpenGL's rows start at the bottom
+        return image
 
 
 def _edges(model: mujoco.MjModel, camera: int) -> NDArray[np.float64]:

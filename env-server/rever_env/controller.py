@@ -100,7 +100,8 @@ class Controller:
             distance = self._miss()
         if distance > settings.failure:
             scratch.qpos[:] = data.qpos
-        return joints.copy()
+        found: Vector = joints.copy()
+        return found
 
     def _miss(self) -> float:
         """Norm of the residual, which is filled: commanded minus scratch pose in the world frame.

@@ -50,6 +50,11 @@ pub trait Message: Serialize + DeserializeOwned {
     /// Checks every value; the reason names the field, what was expected and what came.
     fn validate(&self) -> Result<(), String>;
 
+    /// The one value of bytes that may be large, such as a picture: what it holds has no part in the message's shape.
+    fn bulk(&mut self) -> Option<&mut Vec<u8>> {
+        None
+    }
+
     /// Looks at the raw bytes first, so that another version is refused for its version and not for its fields.
     fn recognise(_bytes: &[u8]) -> Result<(), String> {
         Ok(())
@@ -80,8 +85,8 @@ pub fn parse<M: Message>(bytes: &[u8]) -> Result<(M, Option<CodecError>), CodecE
     let malformed = |reason| CodecError::Malformed { message: M::NAME, reason };
     let shape_came = structure::check(bytes).map_err(malformed)?;
     M::recognise(bytes).map_err(|reason| CodecError::Invalid { message: M::NAME, reason })?;
-    let message: M = rmp_serde::from_slice(bytes).map_err(|error| malformed(words(error)))?;
-    let meant = shape(&message, bytes.len()).map_err(malformed)?;
+    let mut message: M = rmp_serde::from_slice(bytes).map_err(|error| malformed(words(error)))?;
+    let meant = shape(&mut message).map_err(malformed)?;
     if shape_came != meant {
         return Err(malformed(format!("expected the shape {meant}, got {shape_came}")));
     }
@@ -105,9 +110,12 @@ fn words(error: rmp_serde::decode::Error) -> String {
     }
 }
 
-/// The shape of `message` as it is written, in about `expected` bytes: a picture is not moved while it grows.
-fn shape<M: Message>(message: &M, expected: usize) -> Result<structure::Shape, String> {
-    let mut bytes = Vec::with_capacity(expected);
-    rmp_serde::encode::write_named(&mut bytes, message).map_err(|error| error.to_string())?;
-    structure::check(&bytes)
+/// The shape of `message` as it is written. Its bulk is not copied for that.
+fn shape<M: Message>(message: &mut M) -> Result<structure::Shape, String> {
+    let bulk = message.bulk().map(std::mem::take);
+    let written = rmp_serde::to_vec_named(message);
+    if let (Some(place), Some(bulk)) = (message.bulk(), bulk) {
+        *place = bulk;
+    }
+    structure::check(&written.map_err(|error| error.to_string())?)
 }

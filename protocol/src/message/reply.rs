@@ -122,6 +122,17 @@ impl Message for Reply {
     const NAME: &'static str = "reply";
     const BYTES_MAX: usize = REPLY_BYTES_MAX;
 
+    fn bulk(&mut self) -> Option<&mut Vec<u8>> {
+        match self {
+            Reply::Observed { observation, .. }
+            | Reply::Restored { observation, .. }
+            | Reply::Stepped { transition: Transition { observation, .. }, .. } => {
+                Some(&mut observation.image.pixels)
+            }
+            _ => None,
+        }
+    }
+
     fn validate(&self) -> Result<(), String> {
         value::sequence(
             self.sequence(),
