@@ -4,12 +4,12 @@ use std::process::ExitCode;
 
 use agent::command::Program;
 use clap::Parser;
+use protocol::transport::{RUNTIME_POOL, RUNTIME_VARIABLE};
 
 fn main() -> ExitCode {
-    let (name, value) = protocol::transport::RUNTIME;
-    if std::env::var_os(name).is_none() {
+    if std::env::var_os(RUNTIME_VARIABLE).is_none() {
         // SAFETY: no other thread runs yet that could read the environment.
-        unsafe { std::env::set_var(name, value) };
+        unsafe { std::env::set_var(RUNTIME_VARIABLE, RUNTIME_POOL) };
     }
     // Wrong usage ends inside `parse`, with status 2 and a message that says what was expected.
     let program = Program::parse();

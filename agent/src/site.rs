@@ -19,7 +19,7 @@ pub struct Site {
     pub simulator: Simulator,
     /// Endpoints of a router or of servers that run already.
     pub connect: Vec<String>,
-    /// Endpoints that others may connect to, such as a trainer; a free loopback port when servers are started here.
+    /// Endpoints that others may connect to, such as a trainer. Servers that are started here have one of their own.
     pub listen: Vec<String>,
     /// Who meets whom.
     pub fleet: String,
@@ -69,14 +69,12 @@ impl Site {
 
     /// Local servers connect to this agent; to reach others nothing needs to listen here.
     pub fn network_options(&self) -> NetworkOptions {
-        let defaults = NetworkOptions::default();
-        let needs_port = self.listen.is_empty() && self.servers > 0;
         NetworkOptions {
             connect: self.connect.clone(),
-            listen: if needs_port { defaults.listen } else { self.listen.clone() },
+            listen_here: self.servers > 0,
+            listen: self.listen.clone(),
             fleet: self.fleet.clone(),
-            multicast: defaults.multicast,
-            timing: defaults.timing,
+            ..NetworkOptions::default()
         }
     }
 

@@ -2,12 +2,13 @@
 
 use crate::limits::MESSAGE_BYTES_MAX;
 
-/// A variable of the environment, from which alone zenoh takes its threads, and its value: one pool for all that zenoh does,
-/// so that no message is handed from one thread to another between the socket and the callback. To be set before zenoh is used.
-pub const RUNTIME: (&str, &str) = (
-    "ZENOH_RUNTIME",
-    "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), app: (worker_threads: 4))",
-);
+/// A variable of the environment, from which alone zenoh takes its threads. To be set before zenoh is used.
+pub const RUNTIME_VARIABLE: &str = "ZENOH_RUNTIME";
+/// One pool for all that zenoh does, so that no message is handed from one thread to another between the socket and the
+/// callback. Several threads, for programs whose callbacks may wait: the caches of outcomes and verifiers answer in them.
+pub const RUNTIME_POOL: &str = "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), app: (worker_threads: 4))";
+/// A pool of one thread, for programs whose callbacks only hand on: threads that share messages wake one another.
+pub const RUNTIME_SINGLE: &str = "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), app: (worker_threads: 1))";
 /// A slow reader holds a message up that long before the link is given up.
 const CONGESTION_MICROSECONDS: u64 = 60_000_000;
 /// A reply with its picture is three of zenoh's batches or more: all of them fit into the queue at once, where two, zenoh's

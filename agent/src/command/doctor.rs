@@ -158,7 +158,7 @@ fn check_verifier(path: &Path, policy: &Policy) -> Result<((), String)> {
     Ok(((), format!("{}: digest {}, fits the policy", path.display(), short(verifier.digest()))))
 }
 
-/// Opens the network on loopback, finds a server, resets a world and steps it once.
+/// Opens the network on this machine, finds a server, resets a world and steps it once.
 fn check_world(
     site: &Site,
     python: Option<PythonEnvironment>,

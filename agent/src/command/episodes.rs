@@ -46,7 +46,7 @@ pub struct EpisodesArguments {
     /// Use servers that run already: endpoints of them or of a router, as tcp/HOST:PORT.
     #[arg(long, value_delimiter = ',')]
     pub connect: Vec<String>,
-    /// Listen here for others, such as a trainer that publishes verifiers [default: a free loopback port].
+    /// Listen here for others, such as a trainer that publishes verifiers [default: a socket of this machine, told at the start].
     #[arg(long, value_name = "ENDPOINT", value_delimiter = ',')]
     pub listen: Vec<String>,
     /// Only servers of the same fleet are used.

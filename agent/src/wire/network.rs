@@ -1,17 +1,21 @@
 //! One zenoh session: what it connects to, where it listens, and the servers that it sees.
 
 use std::net::{Ipv4Addr, TcpListener};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use protocol::{Description, Keys, transport};
+use tempfile::TempDir;
 use zenoh::Session;
 
 use super::servers::Servers;
 
 /// Stands for a free port of this machine alone.
 const ANY_LOOPBACK_PORT: &str = "tcp/127.0.0.1:0";
+/// Of a socket in the file system; a system's own limit is 104 or 108 with the name that zenoh adds for a lock.
+const SOCKET_PATH_BYTES_MAX: usize = 96;
 /// Another process may take a port between its choice and its use.
 const PORT_ATTEMPTS_MAX: usize = 10;
 /// A client waits this long for the router or server that it is told to connect to.
@@ -22,6 +26,9 @@ const CLIENT_WAIT_MS: u32 = 30_000;
 pub struct NetworkOptions {
     /// Routers or servers elsewhere, as `tcp/host:port`.
     pub connect: Vec<String>,
+    /// Listen where programs of this machine can connect to. On Unix that is a socket in a folder that only this user may
+    /// open, which costs a reply less than TCP does; elsewhere a free port of the loopback interface.
+    pub listen_here: bool,
     /// Endpoints that others may connect to; `tcp/127.0.0.1:0` takes a free port.
     pub listen: Vec<String>,
     /// Who meets whom.
@@ -55,14 +62,17 @@ pub struct Network {
     pub(super) servers: Arc<Servers>,
     pub(super) timing: Timing,
     listening: Vec<String>,
+    /// Holds the socket; goes with the last clone.
+    _folder: Option<Arc<TempDir>>,
 }
 
 impl Default for NetworkOptions {
-    /// Listens on a free port of the loopback interface.
+    /// Listens on this machine alone.
     fn default() -> Self {
         Self {
             connect: Vec::new(),
-            listen: vec![ANY_LOOPBACK_PORT.to_owned()],
+            listen_here: true,
+            listen: Vec::new(),
             fleet: "local".to_owned(),
             multicast: false,
             timing: Timing::default(),
@@ -86,12 +96,23 @@ impl Network {
     /// Opens the session. Needs a tokio runtime with several threads.
     pub async fn open(options: NetworkOptions) -> anyhow::Result<Self> {
         let keys = Keys::new(&options.fleet)?;
-        let (session, listening) = open_session(&options).await?;
+        let here = options.listen_here.then(|| here(&tempfile::env::temp_dir())).transpose()?;
+        let (here, folder) = here.unzip();
+        let listen: Vec<String> = here.into_iter().chain(options.listen.clone()).collect();
+        let (session, listening) = open_session(&options, &listen).await?;
         let servers = Servers::watch(&session, &keys).await?;
-        Ok(Self { session, keys, servers, timing: options.timing, listening })
+        let timing = options.timing;
+        Ok(Self {
+            session,
+            keys,
+            servers,
+            timing,
+            listening,
+            _folder: folder.flatten().map(Arc::new),
+        })
     }
 
-    /// The endpoints that servers can connect to, free ports filled in.
+    /// The endpoints that servers can connect to, free ports filled in; the one on this machine comes first.
     pub fn listening(&self) -> &[String] {
         &self.listening
     }
@@ -108,14 +129,41 @@ impl Network {
     }
 }
 
-async fn open_session(options: &NetworkOptions) -> anyhow::Result<(Session, Vec<String>)> {
+/// An endpoint of this machine alone, and the folder that it lies in.
+#[cfg(unix)]
+fn here(parent: &Path) -> anyhow::Result<(String, Option<TempDir>)> {
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
+
+    let mut folder = tempfile::Builder::new();
+    folder.prefix("rever-").permissions(Permissions::from_mode(0o700));
+    let folder = folder.tempdir_in(parent).context("no temporary folder for a socket")?;
+    let socket = folder.path().join("zenoh");
+    // What begins an endpoint's parameters cannot stand in its address.
+    let fits = |path: &&str| path.len() <= SOCKET_PATH_BYTES_MAX && !path.contains(['?', '#', ';']);
+    Ok(match socket.to_str().filter(fits) {
+        Some(path) => (format!("unixsock-stream/{path}"), Some(folder)),
+        None => (ANY_LOOPBACK_PORT.to_owned(), None),
+    })
+}
+
+/// An endpoint of this machine alone.
+#[cfg(not(unix))]
+fn here(_parent: &Path) -> anyhow::Result<(String, Option<TempDir>)> {
+    Ok((ANY_LOOPBACK_PORT.to_owned(), None))
+}
+
+async fn open_session(
+    options: &NetworkOptions,
+    listen: &[String],
+) -> anyhow::Result<(Session, Vec<String>)> {
     let mut attempt = 1;
     loop {
-        let listening = with_ports(&options.listen)?;
+        let listening = with_ports(listen)?;
         let configuration = configuration(options, &listening)?;
         match zenoh::open(configuration).await {
             Ok(session) => return Ok((session, listening)),
-            Err(error) if listening == options.listen || attempt == PORT_ATTEMPTS_MAX => {
+            Err(error) if listening == listen || attempt == PORT_ATTEMPTS_MAX => {
                 return Err(anyhow!("cannot open the network listening on {listening:?}: {error}"));
             }
             Err(_) => attempt += 1,
@@ -144,4 +192,35 @@ fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Resu
             .map_err(|error| anyhow!("zenoh does not take {key} = {value}: {error}"))?;
     }
     Ok(configuration)
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn the_socket_is_this_users_alone_and_goes_with_the_network() -> anyhow::Result<()> {
+        let network = Network::open(NetworkOptions::default()).await?;
+        let endpoint = network.listening()[0].clone();
+        let socket = Path::new(endpoint.strip_prefix("unixsock-stream/").context("no socket")?);
+        let folder = socket.parent().context("no folder")?;
+        assert!(socket.exists());
+        assert_eq!(folder.metadata()?.permissions().mode() & 0o777, 0o700);
+        network.close().await?;
+        assert!(!folder.exists());
+        Ok(())
+    }
+
+    #[test]
+    fn a_folder_with_too_long_a_name_for_a_socket_gives_a_port() -> anyhow::Result<()> {
+        let folder = tempfile::tempdir()?;
+        let deep = folder.path().join("d".repeat(SOCKET_PATH_BYTES_MAX));
+        std::fs::create_dir(&deep)?;
+        assert_eq!(here(&deep)?.0, ANY_LOOPBACK_PORT);
+        assert!(here(folder.path())?.0.starts_with("unixsock-stream/"));
+        assert_eq!(deep.read_dir()?.count(), 0);
+        Ok(())
+    }
 }

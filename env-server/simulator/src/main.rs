@@ -27,6 +27,7 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
+use protocol::transport::{RUNTIME_POOL, RUNTIME_SINGLE, RUNTIME_VARIABLE};
 
 /// The world of rever_env, natively.
 #[derive(Parser)]
@@ -46,8 +47,13 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    for (name, value) in [protocol::transport::RUNTIME, camera::DRAWING_THREADS] {
-        if std::env::var_os(name).is_none() {
+    // What an agent has set for itself comes down to the servers that it starts, and is no user's choice.
+    let defaults = [
+        (RUNTIME_VARIABLE, RUNTIME_SINGLE, RUNTIME_POOL),
+        (camera::DRAWING_THREADS.0, camera::DRAWING_THREADS.1, camera::DRAWING_THREADS.1),
+    ];
+    for (name, value, inherited) in defaults {
+        if std::env::var_os(name).is_none_or(|chosen| chosen == inherited) {
             // SAFETY: no other thread runs yet that could read the environment.
             unsafe { std::env::set_var(name, value) };
         }
