@@ -1,4 +1,4 @@
-//! How both sides configure zenoh: loopback and nothing else unless told otherwise, and the limits on messages.
+//! How both sides configure zenoh: this machine and nothing else unless told otherwise, and the limits on messages.
 
 use crate::limits::MESSAGE_BYTES_MAX;
 
