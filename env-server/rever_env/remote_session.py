@@ -57,6 +57,7 @@ class RemoteSession:
         self._sequence = 0
         self._request = b""
         self._asked_at = 0.0
+        self._end = ""  # why the server ended the session
         self._declared: list[Any] = []
         try:
             self._open(ask)
@@ -71,6 +72,8 @@ class RemoteSession:
 
     def send(self, make: Callable[[int], protocol.Request]) -> None:
         """Sends the next request; make: its number to the request."""
+        if self._end:
+            raise RemoteRefused(self._end)  # nobody would answer
         self._request = protocol.REQUEST.encode(make(self._sequence + 1))
         self._sequence += 1
         self._asked_at = time.monotonic()
@@ -89,6 +92,8 @@ class RemoteSession:
             self._publisher.put(self._request)
             wait = min(2.0 * wait, _RESEND_SECS_MAX)
         if isinstance(reply, protocol.Refused):
+            if reply.sequence == 0:  # every request of ours can be read: it is the session's end
+                self._end = reply.reason
             raise RemoteRefused(reply.reason)
         if isinstance(reply, protocol.Faulted):
             raise RemoteFault(f"server {self.server}: {reply.kind.value}: {reply.reason}")

@@ -233,6 +233,8 @@ class Server:
         reply = lease.session.answer(sample.payload.to_bytes())
         if reply is not None:
             lease.publisher.put(reply)
+        # However long that took, its holder was not the silent one.
+        lease.used_at = time.monotonic()
 
     def _end_abandoned(self, now: float) -> None:
         for name, lease in list(self._leases.items()):

@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,14 +13,19 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import zenoh
 from conftest import free_endpoint
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import rever_env
+from rever_env import tasks
 from rever_env.remote_session import RemoteFault, RemoteRefused
+from rever_env.server import Server, ServerOptions
+from rever_env.serving import Endpoints
 from rever_env.tasks import Task
-from rever_env.world import World
+from rever_env.world import Observation, World
+from rever_env.worlds import Worlds
 
 SPOON = "widowx_spoon_on_towel"
 STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
@@ -88,6 +95,51 @@ def test_a_gymnasium_environment_is_the_same_behind_a_server() -> None:
         )
         check_env(made.unwrapped, skip_close_check=True)
     made.close()
+    remote.close()
+    process.kill()
+    process.wait()
+
+
+class Slow(World):
+    """Takes its time before an episode."""
+
+    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+        time.sleep(3.2)
+        return super().reset(configuration=configuration, seed=seed)
+
+
+def test_a_holder_who_waits_for_a_slow_world_is_not_taken_for_silent() -> None:
+    """The request is sent again after 0.5 and 1.5 s, so that 1.7 s are silent."""
+    endpoint = free_endpoint()
+    stop = threading.Event()
+    ready = threading.Event()
+    network = zenoh.open(zenoh.Config.from_json5(Endpoints((), (endpoint,), False).configuration()))
+    worlds = Worlds(tasks.load(), 1, Slow)
+    server = Server(network, worlds, ServerOptions(idle_secs_max=1))
+    thread = threading.Thread(target=server.run, args=(stop, lambda _: ready.set()))
+    thread.start()
+    assert ready.wait(10.0)
+    remote = rever_env.RemoteEnv(endpoint, SPOON, image_height=0, image_width=0)
+    try:
+        remote.reset(seed=1)
+        observation, _, _, _, _ = remote.step(STILL)
+        assert observation["instruction"] == worlds.tasks[SPOON, "default"].instruction
+    finally:
+        remote.close()
+        stop.set()
+        thread.join()
+        network.close()  # type: ignore[no-untyped-call]
+
+
+def test_a_session_that_the_server_ended_says_why_and_closes_at_once() -> None:
+    endpoint = free_endpoint()
+    process = serve(endpoint, "--idle-secs", "1")
+    remote = rever_env.RemoteEnv(endpoint, SPOON, image_height=0, image_width=0)
+    remote.reset(seed=1)
+    time.sleep(2.0)
+    for _ in range(2):
+        with pytest.raises(RemoteRefused, match="ended: no request came for 1 s"):
+            remote.step(STILL)
     remote.close()
     process.kill()
     process.wait()

@@ -158,7 +158,11 @@ async fn repeated(subject: &Subject<'_>) -> Result<Tested> {
         talk.go().await?;
         for _ in 0..2 {
             let again = talk.answer_to(&talk.request.clone()).await?;
-            ensure!(again == talk.reply, "expected the same bytes again, got others");
+            ensure!(
+                again == talk.reply,
+                "expected the same bytes again, got {}",
+                described(&again)
+            );
         }
     }
     let twice = talk.reply.clone();
@@ -169,6 +173,18 @@ async fn repeated(subject: &Subject<'_>) -> Result<Tested> {
     ensure!(clean.reply == twice, "expected what a session without repetitions gives");
     clean.close().await?;
     Ok(Tested::Kept)
+}
+
+/// A reply in a few words.
+fn described(bytes: &[u8]) -> String {
+    match decode(bytes) {
+        Ok(Reply::Refused { sequence, reason }) => format!("Refused number {sequence}: {reason}"),
+        Ok(Reply::Faulted { sequence, reason, .. }) => {
+            format!("Faulted number {sequence}: {reason}")
+        }
+        Ok(reply) => format!("other bytes, {} number {}", reply.kind(), reply.sequence()),
+        Err(error) => format!("what is no reply: {error}"),
+    }
 }
 
 /// What was refused has left the world as it was, and the session goes on.

@@ -302,6 +302,8 @@ impl<'a> Server<'a> {
         if let Some(reply) = reply {
             publish(&lease.publisher, reply);
         }
+        // However long that took, its holder was not the silent one.
+        locked(&lease.signs).used_at = Instant::now();
     }
 
     fn end_abandoned(&mut self, now: Instant) {
