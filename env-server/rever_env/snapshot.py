@@ -62,7 +62,10 @@ def unpack(
     data: mujoco.MjData,
     controller: Controller,
 ) -> tuple[Memory, int]:
-    """Puts the state into data and controller; returns statistics' memory and step count."""
+    """Puts the state into data and controller; returns statistics' memory and step count.
+
+    Whoever calls it brings what follows from the state up to date.
+    """
     size = mujoco.mj_stateSize(model, _STATE)
     expected = _HEADER.size + 8 * (size + 17)
     if len(content) != expected:
@@ -78,9 +81,6 @@ def unpack(
     state, rest = floats[:size], floats[size:]
     mujoco.mj_resetData(model, data)
     mujoco.mj_setState(model, data, state, _STATE)
-    warm_start = data.qacc_warmstart.copy()
-    mujoco.mj_forward(model, data)
-    data.qacc_warmstart[:] = warm_start
     controller.position, controller.quaternion = rest[:3].copy(), rest[3:7].copy()
     memory = Memory(
         source_origin=rest[7:9].copy(),

@@ -47,6 +47,8 @@ _DIVERGENCE = {
         mujoco.mjtWarning.mjWARN_BADQACC,
     )
 }
+# MuJoCo's marks of a kinematic tree that has moved just now, and of one that has long been still.
+_AWAKE, _READY_TO_SLEEP = -(1 + mujoco.mjMINAWAKE), -1
 # Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
 DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
@@ -144,6 +146,7 @@ class World:
         self.memory, self.steps = snapshot.unpack(
             content, self.task, self.model, self.data, self.controller
         )
+        self._forward()
         return self._observe()
 
     def expert_action(self) -> NDArray[np.float64]:
@@ -217,14 +220,26 @@ class World:
         mujoco.mj_step(self.model, self.data, settings.substeps - len(self._ramp))
         self._refresh()
 
-    def _refresh(self) -> None:
-        """Brings poses and contacts up to date: mj_step leaves them one physics step old.
+    def _forward(self) -> None:
+        """Poses and contacts of this moment: mj_step leaves them one physics step old.
 
-        The warm start is put back, so that going on from here equals going on from a restore.
+        What sleeps is woken, for contacts of sleeping objects are left out and the judge needs
+        them, and goes back to sleep with the next physics step. That follows from the velocities
+        alone, and the warm start is put back: going on from here equals going on from a restore.
         """
-        warm_start = self.data.qacc_warmstart.copy()
-        mujoco.mj_forward(self.model, self.data)
-        self.data.qacc_warmstart[:] = warm_start
+        data = self.data
+        warm_start = data.qacc_warmstart.copy()
+        asleep = np.maximum.reduceat(np.abs(data.qvel), self.model.tree_dofadr) == 0.0  # (trees,)
+        resting = asleep[self.model.dof_treeid]
+        data.qvel[resting] = -0.0  # what MuJoCo wakes and nothing else
+        mujoco.mj_forward(self.model, data)
+        data.qvel[resting] = 0.0
+        data.tree_asleep[:] = np.where(asleep, _READY_TO_SLEEP, _AWAKE)
+        data.qacc_warmstart[:] = warm_start
+
+    def _refresh(self) -> None:
+        """Brings poses and contacts up to date, and looks whether the physics is still sound."""
+        self._forward()
         speeds = np.abs(self.data.qvel)
         fastest = int(speeds.argmax())
         speed = float(speeds[fastest])

@@ -68,6 +68,26 @@ def test_what_lies_beyond_the_edges_is_left_out_and_changes_no_pixel(
             assert 3 <= np.count_nonzero(hidden) < np.count_nonzero(model.geom_group < 3) - 10
 
 
+def test_objects_at_rest_sleep_and_the_judge_feels_what_they_touch(
+    world: World, task: Task
+) -> None:
+    world.reset(configuration=3, seed=0)
+    source = world.model.body_treeid[world.model.body(task.source).id]
+    for _ in range(3):
+        world.step(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
+        touch = world.judge.touch(world.data)
+        assert (touch.robot, touch.target, touch.elsewhere) == (False, False, True)
+    contacts = world.data.ncon
+    saved = world.save()
+    mujoco.mj_step(world.model, world.data, 2)
+    assert world.data.tree_asleep[source] >= 0
+    assert world.data.ncon < contacts
+    assert (world.data.tree_asleep[world.model.tree_dofnum != 6] < 0).all()  # the robot's
+    world.restore(saved)
+    assert world.data.ncon == contacts
+    assert world.save() == saved
+
+
 def test_save_and_restore_are_exact(world: World, task: Task) -> None:
     world.reset(configuration=3, seed=0)
     _run(world, _actions(10))

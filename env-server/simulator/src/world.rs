@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Once};
 
-use mujoco_rs::mujoco_c::mju_user_warning;
+use mujoco_rs::mujoco_c::{mjMINAWAKE, mju_user_warning};
 use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::fun::utility::*;
 use protocol::{Observation, Statistics, Transition};
@@ -21,6 +21,9 @@ const START_GAP: f64 = 0.002;
 /// m/s or rad/s: beyond this the physics is broken, not fast. What falls off the table lands on an
 /// edge and spins at more than 100 rad/s.
 const SPEED_MAX: f64 = 1000.0;
+/// MuJoCo's marks of a kinematic tree that has moved just now, and of one that has long been still.
+const AWAKE: i32 = -1 - mjMINAWAKE as i32;
+const READY_TO_SLEEP: i32 = -1;
 /// Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
 const DOWN: [f64; 9] = [0.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0];
 /// All that goes into the next physics step, the warm start included.
@@ -249,15 +252,36 @@ impl World {
         (0..physics_steps).for_each(|_| self.data.step());
     }
 
-    /// Brings poses and contacts up to date: a physics step leaves them one step old.
+    /// Poses and contacts of this moment: a physics step leaves them one step old.
     ///
-    /// The warm start is put back, so that going on from here equals going on from a restore.
+    /// What sleeps is woken, for contacts of sleeping objects are left out and the judge needs them, and goes back to
+    /// sleep with the next physics step. That follows from the velocities alone, and the warm start is put back: going
+    /// on from here equals going on from a restore.
     fn forward(&mut self) {
         let warm_start = self.data.qacc_warmstart().to_vec();
+        let model = self.data.model();
+        let mut marks = vec![READY_TO_SLEEP; model.tree_dofadr().len()];
+        for (speed, &tree) in self.data.qvel().iter().zip(model.dof_treeid()) {
+            if *speed != 0.0 {
+                marks[tree as usize] = AWAKE;
+            }
+        }
+        let trees = model.dof_treeid().iter().enumerate();
+        let resting = trees.filter(|(_, tree)| marks[**tree as usize] == READY_TO_SLEEP);
+        let resting: Vec<usize> = resting.map(|(dof, _)| dof).collect();
+        for &dof in &resting {
+            self.data.qvel_mut()[dof] = -0.0; // what MuJoCo wakes and nothing else
+        }
         self.data.forward();
+        for &dof in &resting {
+            self.data.qvel_mut()[dof] = 0.0;
+        }
+        // SAFETY: no mark is an index; MuJoCo counts such marks upwards to -1.
+        unsafe { self.data.tree_asleep_mut() }.copy_from_slice(&marks);
         self.data.qacc_warmstart_mut().copy_from_slice(&warm_start);
     }
 
+    /// Brings poses and contacts up to date, and looks whether the physics is still sound.
     fn refresh(&mut self, steps: u32) -> Result<(), Fault> {
         self.forward();
         let warned = WARNINGS
