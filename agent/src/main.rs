@@ -7,6 +7,7 @@ use clap::Parser;
 use protocol::transport::{RUNTIME_POOL, RUNTIME_VARIABLE};
 
 fn main() -> ExitCode {
+    keep_freed_memory();
     if std::env::var_os(RUNTIME_VARIABLE).is_none() {
         // SAFETY: no other thread runs yet that could read the environment.
         unsafe { std::env::set_var(RUNTIME_VARIABLE, RUNTIME_POOL) };
@@ -22,5 +23,16 @@ fn main() -> ExitCode {
             eprintln!("error: {error:#}");
             ExitCode::from(1)
         }
+    }
+}
+
+/// glibc gives memory as large as a picture back to the system as soon as it is free, and takes it anew for the next one,
+/// page by page. The limits are where its own adaptation ends, after something large was freed.
+fn keep_freed_memory() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: no other thread runs yet; a limit that is refused changes nothing.
+    unsafe {
+        libc::mallopt(libc::M_MMAP_THRESHOLD, 32 << 20);
+        libc::mallopt(libc::M_TRIM_THRESHOLD, 64 << 20);
     }
 }

@@ -1,8 +1,12 @@
 """Sessions over zenoh, all stepped by one thread: the one that owns the rendering contexts.
 
-zenoh's threads only enqueue: callback -> bounded queue -> simulation thread -> session -> reply.
+It waits for requests in zenoh's own channel: request -> inbox -> simulation thread -> session ->
+reply. All else that it has to do waits in a queue, and a message to the inbox says so: waking it by
+Python's locks would cost each request another switch of threads.
 """
 
+import collections
+import contextlib
 import logging
 import os
 import queue
@@ -29,7 +33,8 @@ _log = logging.getLogger(__name__)
 _BEAT_SECS = 0.5
 _HOLDER_SECS_MAX = 10.0  # from opening a session to its holder's token
 _CLOSED_SECS_MAX = 10.0  # a closed session still answers: its last reply may have been lost
-_PENDING_PER_SESSION_MAX = 4  # requests waiting in the queue; the holder resends what is dropped
+_PENDING_PER_SESSION_MAX = 4  # requests in the inbox; the holder resends what is dropped
+_TICK, _WORK = "tick", "work"  # messages of our own to the inbox
 
 
 @dataclass(frozen=True)
@@ -43,11 +48,7 @@ class ServerOptions:
 
 @dataclass
 class _Lease:
-    """A session with what zenoh holds for it.
-
-    zenoh's threads write used_at and holder at once: a simulation thread that was busy for long
-    must not take what waits in its queue for silence.
-    """
+    """A session with what zenoh holds for it. zenoh's threads write holder."""
 
     session: Session
     publisher: Any
@@ -82,14 +83,18 @@ class Server:
         self._keys = protocol.Keys(options.fleet)
         self._leases: dict[str, _Lease] = {}
         self._ended_steps = 0
-        # The simple queue wakes its reader faster than the bounded one; the callback bounds it.
+        self._pending_max = (options.sessions_max + 1) * _PENDING_PER_SESSION_MAX
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._work_max = (options.sessions_max + 1) * _PENDING_PER_SESSION_MAX
+        self._ticks: collections.deque[float] = collections.deque(maxlen=self._pending_max)
         self._description()  # worlds that cannot be described are refused now
 
     def run(self, stop: threading.Event, ready: Callable[[str], None]) -> None:
         """Declares everything, the liveliness token last; then works until stop is set."""
+        inbox = self._network.declare_subscriber(
+            self._keys.requests(self.id), zenoh.handlers.RingChannel(self._pending_max)
+        )
         declared: list[Any] = [
+            inbox,
             self._network.declare_queryable(
                 self._keys.describe(self.id), _direct(self._enqueuing(self._describe))
             ),
@@ -105,37 +110,68 @@ class Server:
         declared.append(heartbeat)
         declared.append(self._network.liveliness().declare_token(self._keys.server(self.id)))
         ready(self.id)
+        ended = threading.Event()
+        threading.Thread(target=self._tick, args=(stop, ended), name="clock", daemon=True).start()
         try:
-            self._loop(stop, heartbeat)
+            self._loop(stop, inbox, heartbeat)
         finally:
+            ended.set()
             for declaration in reversed(declared):
                 declaration.undeclare()
             for name in list(self._leases):
                 self._end(name, None)
             self._worlds.close()
 
-    def _loop(self, stop: threading.Event, heartbeat: Any) -> None:
+    def _loop(self, stop: threading.Event, inbox: Any, heartbeat: Any) -> None:
         beat_at = time.monotonic()
         while not stop.is_set():
-            now = time.monotonic()
-            if now >= beat_at:
-                heartbeat.put(protocol.HEARTBEAT.encode(self._heartbeat()))
-                self._end_abandoned(now)
-                beat_at = now + _BEAT_SECS
-            try:
-                work = self._work.get(timeout=max(beat_at - now, 0.001))
-            except queue.Empty:
+            sample = inbox.recv()
+            name = str(sample.key_expr).split("/")[-2]
+            lease = self._leases.get(name)
+            if lease is not None:
+                self._answer(lease, sample.payload)
                 continue
-            work()
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    self._work.get_nowait()()
+            if name == self._named(_TICK) and self._ticks:
+                self._end_abandoned(self._ticks.popleft())
+                if time.monotonic() >= beat_at:
+                    heartbeat.put(protocol.HEARTBEAT.encode(self._heartbeat()))
+                    beat_at = time.monotonic() + _BEAT_SECS / 2
+
+    def _tick(self, stop: threading.Event, ended: threading.Event) -> None:
+        """Tells the simulation thread that time passes, and at once when stop is set."""
+        stopped = False
+        while not stopped:
+            stopped = stop.wait(_BEAT_SECS)
+            if ended.is_set():
+                return
+            self._ticks.append(time.monotonic())
+            self._wake(_TICK)
+
+    def _wake(self, kind: str) -> None:
+        """Puts a message of our own behind the requests in the inbox."""
+        with contextlib.suppress(zenoh.ZError):  # the network is closed: nobody waits any more
+            self._network.put(
+                self._keys.request(self._named(kind)),
+                b"",
+                allowed_destination=zenoh.Locality.SESSION_LOCAL,
+            )
+
+    def _named(self, name: str) -> str:
+        """What the inbox takes for one of this server's sessions."""
+        return f"{self.id}.{name}"
 
     def _enqueuing(self, act: Callable[[Any], None]) -> Callable[[Any], None]:
         """A callback that leaves act to the simulation thread and drops what is too much."""
 
         def callback(event: Any) -> None:
-            if self._work.qsize() < self._work_max:
+            if self._work.qsize() < self._pending_max:
                 self._work.put(lambda: act(event))
+                self._wake(_WORK)
             else:
-                _log.warning("more is asked than %d waiting requests", self._work_max)
+                _log.warning("more is asked than %d waiting requests", self._pending_max)
 
         return callback
 
@@ -187,7 +223,7 @@ class Server:
     def _lease(self, opened: protocol.Open) -> str:
         """A new session; everything that hears its requests stands when this returns."""
         session = Session(opened, self._worlds)
-        name = secrets.token_hex(8)
+        name = self._named(secrets.token_hex(8))
         publisher = self._network.declare_publisher(
             self._keys.reply(name),
             congestion_control=zenoh.CongestionControl.BLOCK,
@@ -197,22 +233,13 @@ class Server:
         now = time.monotonic()
         lease = _Lease(session, publisher, [publisher], opened_at=now, used_at=now)
         self._leases[name] = lease
-        enqueue = self._enqueuing(lambda sample: self._answer(name, sample))
-
-        def on_request(sample: Any) -> None:
-            lease.used_at = time.monotonic()
-            enqueue(sample)
-
-        look = self._enqueuing(lambda _: self._end_abandoned(time.monotonic()))
+        look = self._enqueuing(lambda _: self._end_gone())
 
         def on_token(sample: Any) -> None:
             lease.on_token(sample)
             if lease.holder == "gone":
-                look(sample)  # at once, or with the next heartbeat if the queue is full
+                look(sample)  # at once, or with the next tick if the queue is full
 
-        lease.declared.append(
-            self._network.declare_subscriber(self._keys.request(name), _direct(on_request))
-        )
         lease.declared.append(
             self._network.liveliness().declare_subscriber(
                 self._keys.session(name), _direct(on_token), history=True
@@ -221,30 +248,32 @@ class Server:
         _log.info("session %s opened for %s", name, opened.holder)
         return name
 
-    def _answer(self, name: str, sample: Any) -> None:
-        lease = self._leases.get(name)
-        if lease is None:
-            return
+    def _answer(self, lease: _Lease, payload: zenoh.ZBytes) -> None:
+        reply: bytes | None
         try:
-            protocol.REQUEST.check_size(len(sample.payload))
+            protocol.REQUEST.check_size(len(payload))
+            reply = lease.session.answer(payload.to_bytes())
         except protocol.TooLarge as error:
-            lease.publisher.put(refused(0, str(error)))
-            return
-        reply = lease.session.answer(sample.payload.to_bytes())
+            reply = refused(0, str(error))
         if reply is not None:
             lease.publisher.put(reply)
         # However long that took, its holder was not the silent one.
         lease.used_at = time.monotonic()
 
-    def _end_abandoned(self, now: float) -> None:
+    def _end_gone(self) -> None:
         for name, lease in list(self._leases.items()):
-            if lease.session.closed and now - lease.used_at > _CLOSED_SECS_MAX:
-                self._end(name, None)
-            elif lease.holder == "gone":
+            if lease.holder == "gone":
                 self._end(name, "its holder is gone")
-            elif lease.holder == "awaited" and now - lease.opened_at > _HOLDER_SECS_MAX:
+
+    def _end_abandoned(self, as_of: float) -> None:
+        """Ends what nobody used until then; what came later may still wait in the inbox."""
+        self._end_gone()
+        for name, lease in list(self._leases.items()):
+            if lease.session.closed and as_of - lease.used_at > _CLOSED_SECS_MAX:
+                self._end(name, None)
+            elif lease.holder == "awaited" and as_of - lease.opened_at > _HOLDER_SECS_MAX:
                 self._end(name, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
-            elif now - lease.used_at > self._options.idle_secs_max:
+            elif as_of - lease.used_at > self._options.idle_secs_max:
                 self._end(name, f"no request came for {self._options.idle_secs_max} s")
 
     def _end(self, name: str, reason: str | None) -> None:

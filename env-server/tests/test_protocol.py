@@ -5,6 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgpack
+import numpy as np
 import pytest
 
 from rever_env import protocol
@@ -161,6 +163,31 @@ def test_flipped_bytes_are_refused_or_read_as_a_valid_message(name: str) -> None
             assert len(protocol.REQUEST.encode(message)) == len(golden)
 
 
+def test_the_short_way_of_reading_tells_the_same_as_the_strict_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def told(data: bytes) -> object:
+        try:
+            return protocol.REQUEST.decode(data)
+        except protocol.CodecError as error:
+            return type(error), str(error), repr(getattr(error, "message", None))
+
+    random = np.random.default_rng(0)
+    step = {"sequence": 2, "action": [1e300]}  # 64 bits, and too large for 32
+    cases = [msgpack.packb({"Step": step})]
+    for file in (*GOLDEN.glob("request_*.msgpack"), *GOLDEN.glob("refused/*.msgpack")):
+        golden = file.read_bytes() or b"x"
+        for _ in range(300):
+            data = bytearray(golden)
+            for place in random.integers(0, len(data), random.integers(0, 3)):
+                data[place] = random.integers(0, 256)
+            cases.append(bytes(data))
+    short = [told(data) for data in cases]
+    monkeypatch.setattr("rever_env.protocol.codec._SMALL_BYTES", -1)
+    assert [told(data) for data in cases] == short
+    assert sum(not isinstance(answer, tuple) for answer in short) > 100
+
+
 def test_a_field_in_another_order_is_read() -> None:
     data = b"\x81\xa4Save\x82\xa4slot\x00\xa8sequence\x03"
     assert protocol.REQUEST.decode(data) == protocol.Save(3, 0)
@@ -198,6 +225,7 @@ def test_keys_lie_under_version_and_fleet() -> None:
     assert keys.heartbeat("s1") == "rever/1/home/server/s1/heartbeat"
     assert keys.session("a") == "rever/1/home/session/a"
     assert keys.request("a") == "rever/1/home/session/a/request"
+    assert keys.requests("s1") == "rever/1/home/session/s1.$*/request"
     assert keys.reply("a") == "rever/1/home/session/a/reply"
     assert keys.outcome("run.1") == "rever/1/home/outcome/run.1"
     assert keys.verifier("best_of-2") == "rever/1/home/verifier/best_of-2"

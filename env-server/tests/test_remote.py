@@ -6,9 +6,10 @@ import threading
 import time
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -101,31 +102,46 @@ def test_a_gymnasium_environment_is_the_same_behind_a_server() -> None:
 
 
 class Slow(World):
-    """Takes its time before an episode."""
+    """Takes its time before the first episode of all."""
+
+    naps: ClassVar[list[float]] = [3.2]
 
     def reset(self, *, configuration: int | None, seed: int) -> Observation:
-        time.sleep(3.2)
+        if self.naps:
+            time.sleep(self.naps.pop())
         return super().reset(configuration=configuration, seed=seed)
 
 
-def test_a_holder_who_waits_for_a_slow_world_is_not_taken_for_silent() -> None:
-    """The request is sent again after 0.5 and 1.5 s, so that 1.7 s are silent."""
+def test_who_waits_for_a_slow_world_is_not_taken_for_silent() -> None:
+    """Requests are sent again after 0.5 and 1.5 s: the slow one's holder is silent for 1.7 s."""
     endpoint = free_endpoint()
     stop = threading.Event()
     ready = threading.Event()
     network = zenoh.open(zenoh.Config.from_json5(Endpoints((), (endpoint,), False).configuration()))
-    worlds = Worlds(tasks.load(), 1, Slow)
-    server = Server(network, worlds, ServerOptions(idle_secs_max=1))
-    thread = threading.Thread(target=server.run, args=(stop, lambda _: ready.set()))
+    server = Server(network, Worlds(tasks.load(), 1, Slow), ServerOptions(idle_secs_max=1))
+    thread = threading.Thread(
+        target=server.run, args=(stop, lambda _: ready.set()), name="simulation", daemon=True
+    )
     thread.start()
     assert ready.wait(10.0)
-    remote = rever_env.RemoteEnv(endpoint, SPOON, image_height=0, image_width=0)
+    remotes = [
+        rever_env.RemoteEnv(endpoint, SPOON, image_height=0, image_width=0) for _ in range(3)
+    ]
+    slow, waiting, dying = remotes
     try:
-        remote.reset(seed=1)
-        observation, _, _, _, _ = remote.step(STILL)
-        assert observation["instruction"] == worlds.tasks[SPOON, "default"].instruction
+        with ThreadPoolExecutor() as pool:
+            first = pool.submit(slow.reset, seed=1)
+            time.sleep(0.2)
+            dying.session._network.close()  # type: ignore[no-untyped-call]
+            time.sleep(0.3)
+            second = pool.submit(waiting.reset, seed=2)
+            for reset in (first, second):
+                assert reset.result()[0]["instruction"] == slow.session.task.instruction
+        slow.step(STILL)
+        waiting.step(STILL)
     finally:
-        remote.close()
+        slow.close()
+        waiting.close()
         stop.set()
         thread.join()
         network.close()  # type: ignore[no-untyped-call]

@@ -20,6 +20,9 @@ Reader = Callable[[object], Any]
 Writer = Callable[[Any], object]
 
 
+_SMALL_BYTES = 1024  # beyond, a second copy of the bytes would cost more than it spares
+
+
 class CodecError(ValueError):
     """A message was not written or not read."""
 
@@ -87,6 +90,28 @@ class Codec(Generic[M]):
     def decode(self, data: bytes) -> M:
         """The message in exactly these bytes."""
         self.check_size(len(data))
+        message = self._as_written(data)
+        return self._strictly(data) if message is None else message
+
+    def _as_written(self, data: bytes) -> M | None:
+        """The message in bytes that are just what encode writes, as small ones nearly always are.
+
+        None of others, and of whatever is wrong, which _strictly finds and names: it looks at each
+        byte, which takes longer.
+        """
+        if len(data) > _SMALL_BYTES or self._recognise is not None:
+            return None
+        try:
+            value = msgpack.unpackb(data)
+            if msgpack.packb(value, use_single_float=True) != data:
+                return None
+            message: M = self._reader(value)
+            message.validate()
+        except (ValueError, OverflowError):
+            return None
+        return message
+
+    def _strictly(self, data: bytes) -> M:
         try:
             structure.check(data)
             value = msgpack.unpackb(data, object_pairs_hook=_once)
