@@ -141,7 +141,7 @@ fn a_gymnasium_environment_conforms() {
     let (failed, passed, said) = conformance_of(&mut command);
     assert!(failed.is_empty(), "{said}");
     // Its action is discrete: no row has nothing to test.
-    assert_eq!(passed, said.lines().filter(|line| !line.contains(" passed, ")).count(), "{said}");
+    assert!(said.contains(&format!("{passed} passed, 0 failed, 0 not tested")), "{said}");
 }
 
 #[test]
