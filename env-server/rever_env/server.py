@@ -296,7 +296,7 @@ class Server:
 
 
 def _direct(callback: Callable[[Any], None]) -> Any:
-    """Called by zenoh's own thread: a thread between the two would cost a switch per request."""
+    """Called by zenoh's own thread, which a callback that only hands on may hold up."""
     return zenoh.handlers.Callback(callback, indirect=False)
 
 

@@ -23,8 +23,8 @@ _CONGESTION_MICROSECONDS = 60_000_000  # a slow reader holds a reply up; it does
 # A reply with its picture is three of zenoh's batches or more: all of them fit into the queue at
 # once, where two, zenoh's own choice, stop the simulation until the first one is gone.
 _QUEUED_BATCHES = 16
-# One pool of threads for all that zenoh does, so that a message is not handed from one thread to
-# another between the socket and the callback.
+# One pool of four threads for all that zenoh does, so that a message is not handed from one to
+# another on its way. Not a single one: a callback that waits for Python's lock must stop nothing.
 _ZENOH_RUNTIME = (
     "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), "
     "app: (worker_threads: 4))"

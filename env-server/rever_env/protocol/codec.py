@@ -19,7 +19,6 @@ from rever_env.protocol import structure
 Reader = Callable[[object], Any]
 Writer = Callable[[Any], object]
 
-
 _SMALL_BYTES = 1024  # beyond, a second copy of the bytes would cost more than it spares
 
 
