@@ -8,6 +8,7 @@ use protocol::transport::{RUNTIME_POOL, RUNTIME_VARIABLE};
 
 fn main() -> ExitCode {
     keep_freed_memory();
+    let_senders_finish();
     if std::env::var_os(RUNTIME_VARIABLE).is_none() {
         // SAFETY: no other thread runs yet that could read the environment.
         unsafe { std::env::set_var(RUNTIME_VARIABLE, RUNTIME_POOL) };
@@ -23,6 +24,16 @@ fn main() -> ExitCode {
             eprintln!("error: {error:#}");
             ExitCode::from(1)
         }
+    }
+}
+
+/// Linux stops whoever wakes another on the same processor, in the middle of a picture that it sends. Not among threads of
+/// this policy, which is for programs that compute; threads and servers that are started from here inherit it.
+fn let_senders_finish() {
+    #[cfg(target_os = "linux")]
+    // SAFETY: the parameters are plain numbers, all zero; a policy that is refused changes nothing.
+    unsafe {
+        libc::sched_setscheduler(0, libc::SCHED_BATCH, &std::mem::zeroed());
     }
 }
 

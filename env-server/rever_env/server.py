@@ -50,6 +50,7 @@ class ServerOptions:
 class _Lease:
     """A session with what zenoh holds for it. zenoh's threads write holder."""
 
+    name: str
     session: Session
     publisher: Any
     declared: list[Any]
@@ -81,7 +82,8 @@ class Server:
         self._worlds = worlds
         self._options = options
         self._keys = protocol.Keys(options.fleet)
-        self._leases: dict[str, _Lease] = {}
+        self._leases: dict[str, _Lease] = {}  # by the key of its requests
+        self._tick_key = self._keys.request(self._named(_TICK))
         self._ended_steps = 0
         self._pending_max = (options.sessions_max + 1) * _PENDING_PER_SESSION_MAX
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -118,23 +120,23 @@ class Server:
             ended.set()
             for declaration in reversed(declared):
                 declaration.undeclare()
-            for name in list(self._leases):
-                self._end(name, None)
+            for key in list(self._leases):
+                self._end(key, None)
             self._worlds.close()
 
     def _loop(self, stop: threading.Event, inbox: Any, heartbeat: Any) -> None:
         beat_at = time.monotonic()
         while not stop.is_set():
             sample = inbox.recv()
-            name = str(sample.key_expr).split("/")[-2]
-            lease = self._leases.get(name)
+            key = str(sample.key_expr)
+            lease = self._leases.get(key)
             if lease is not None:
                 self._answer(lease, sample.payload)
                 continue
             with contextlib.suppress(queue.Empty):
                 while True:
                     self._work.get_nowait()()
-            if name == self._named(_TICK) and self._ticks:
+            if key == self._tick_key and self._ticks:
                 self._end_abandoned(self._ticks.popleft())
                 if time.monotonic() >= beat_at:
                     heartbeat.put(protocol.HEARTBEAT.encode(self._heartbeat()))
@@ -231,8 +233,8 @@ class Server:
             express=True,
         )
         now = time.monotonic()
-        lease = _Lease(session, publisher, [publisher], opened_at=now, used_at=now)
-        self._leases[name] = lease
+        lease = _Lease(name, session, publisher, [publisher], opened_at=now, used_at=now)
+        self._leases[self._keys.request(name)] = lease
         look = self._enqueuing(lambda _: self._end_gone())
 
         def on_token(sample: Any) -> None:
@@ -249,39 +251,34 @@ class Server:
         return name
 
     def _answer(self, lease: _Lease, payload: zenoh.ZBytes) -> None:
-        reply: bytes | None
-        try:
-            protocol.REQUEST.check_size(len(payload))
-            reply = lease.session.answer(payload.to_bytes())
-        except protocol.TooLarge as error:
-            reply = refused(0, str(error))
+        reply = lease.session.answer(payload.to_bytes())
         if reply is not None:
             lease.publisher.put(reply)
         # However long that took, its holder was not the silent one.
         lease.used_at = time.monotonic()
 
     def _end_gone(self) -> None:
-        for name, lease in list(self._leases.items()):
+        for key, lease in list(self._leases.items()):
             if lease.holder == "gone":
-                self._end(name, "its holder is gone")
+                self._end(key, "its holder is gone")
 
     def _end_abandoned(self, as_of: float) -> None:
         """Ends what nobody used until then; what came later may still wait in the inbox."""
         self._end_gone()
-        for name, lease in list(self._leases.items()):
+        for key, lease in list(self._leases.items()):
             if lease.session.closed and as_of - lease.used_at > _CLOSED_SECS_MAX:
-                self._end(name, None)
+                self._end(key, None)
             elif lease.holder == "awaited" and as_of - lease.opened_at > _HOLDER_SECS_MAX:
-                self._end(name, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
+                self._end(key, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
             elif as_of - lease.used_at > self._options.idle_secs_max:
-                self._end(name, f"no request came for {self._options.idle_secs_max} s")
+                self._end(key, f"no request came for {self._options.idle_secs_max} s")
 
-    def _end(self, name: str, reason: str | None) -> None:
-        lease = self._leases.pop(name)
+    def _end(self, key: str, reason: str | None) -> None:
+        lease = self._leases.pop(key)
         self._ended_steps += lease.session.steps
         if reason is not None:
-            _log.info("session %s ended: %s", name, reason)
-            lease.publisher.put(refused(0, f"session {name} ended: {reason}"))
+            _log.info("session %s ended: %s", lease.name, reason)
+            lease.publisher.put(refused(0, f"session {lease.name} ended: {reason}"))
         for declaration in reversed(lease.declared):
             declaration.undeclare()
         lease.session.end()

@@ -14,7 +14,7 @@ pub mod message;
 mod structure;
 pub mod transport;
 
-pub use codec::{CodecError, Message, decode, encode};
+pub use codec::{CodecError, Message, decode, decode_shared, encode};
 pub use keys::{KeyError, Keys};
 pub use message::*;
 

@@ -1,6 +1,7 @@
 //! The structure of raw MessagePack bytes, checked before anything is decoded or allocated from them.
 
 use std::fmt;
+use std::ops::Range;
 
 use crate::limits::{DEPTH_MAX, ELEMENTS_MAX};
 
@@ -17,13 +18,31 @@ pub struct Shape {
     nils: usize,
 }
 
+/// What a check tells of bytes that it accepts.
+#[derive(Debug)]
+pub struct Structure {
+    /// Of the whole.
+    pub shape: Shape,
+    /// The last value of bytes, if there is one; no message has two.
+    pub bulk: Option<Bulk>,
+}
+
+/// Where a value of bytes lies.
+#[derive(Debug)]
+pub struct Bulk {
+    /// Its marker.
+    pub start: usize,
+    /// Behind marker and length.
+    pub content: Range<usize>,
+}
+
 /// Accepts exactly one value made of maps with text keys, arrays, text, bytes, integers, 32-bit floats, booleans and
 /// nil, each in its shortest form, nested and counted within the limits.
-pub fn check(bytes: &[u8]) -> Result<Shape, String> {
-    let mut reader = Reader { bytes, position: 0, shape: Shape::default() };
+pub fn check(bytes: &[u8]) -> Result<Structure, String> {
+    let mut reader = Reader { bytes, position: 0, shape: Shape::default(), bulk: None };
     reader.value(1)?;
     match bytes.len() - reader.position {
-        0 => Ok(reader.shape),
+        0 => Ok(Structure { shape: reader.shape, bulk: reader.bulk }),
         rest => {
             Err(format!("expected the end after byte {}, got {rest} more bytes", reader.position))
         }
@@ -34,6 +53,7 @@ struct Reader<'a> {
     bytes: &'a [u8],
     position: usize,
     shape: Shape,
+    bulk: Option<Bulk>,
 }
 
 impl Reader<'_> {
@@ -53,7 +73,9 @@ impl Reader<'_> {
             0xc4..=0xc6 => {
                 let length = self.header(1 << (marker - 0xc4), 1, 0, start)?;
                 self.shape.bytes += 1;
+                let content = self.position;
                 self.skip(length)?;
+                self.bulk = Some(Bulk { start, content: content..self.position });
             }
             0xca => {
                 self.shape.floats += 1;

@@ -39,7 +39,7 @@ pub fn read(file: &Path) -> Result<Vec<Observation>> {
                     "{name}: expected U8, got {:?}",
                     tensor.dtype()
                 );
-                let image = Image { height, width, pixels: tensor.data().to_vec() };
+                let image = Image { height, width, pixels: tensor.data().to_vec().into() };
                 let name = format!("{index}.instruction");
                 let instruction = metadata.get(&name);
                 let instruction =

@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use protocol::{Image, Open, Opening, Reply, Request, Reset, decode, encode};
+use bytes::Bytes;
+use protocol::{Image, Open, Opening, Reply, Request, Reset, decode, decode_shared, encode};
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use zenoh::bytes::ZBytes;
@@ -180,7 +181,8 @@ impl Environment {
                 payload = self.replies.recv() => {
                     let payload = payload.ok_or_else(|| EnvironmentFault::wire("the network is closed"))?;
                     protocol::codec::check_size::<Reply>(payload.len()).map_err(EnvironmentFault::wire)?;
-                    let reply: Reply = decode(&payload.to_bytes()).map_err(EnvironmentFault::wire)?;
+                    let bytes = Bytes::from(payload.to_bytes().into_owned());
+                    let reply: Reply = decode_shared(&bytes).map_err(EnvironmentFault::wire)?;
                     // Number 0 is about the session itself, or about a request that could not be read.
                     if reply.sequence() == self.sequence || reply.sequence() == 0 {
                         return Ok(Some(reply));

@@ -67,8 +67,12 @@ impl VerifierPublisher {
     /// Publishes `weights` as the newest version, for agents with the policy of digest `policy`.
     pub async fn publish(&self, policy: &str, weights: Vec<u8>) -> anyhow::Result<()> {
         let digest = digest_of(&weights);
-        let update =
-            VerifierUpdate { name: self.name.clone(), digest, policy: policy.to_owned(), weights };
+        let update = VerifierUpdate {
+            name: self.name.clone(),
+            digest,
+            policy: policy.to_owned(),
+            weights: weights.into(),
+        };
         let bytes = encode(&update)?;
         self.publisher
             .put(bytes)

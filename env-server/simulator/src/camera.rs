@@ -5,6 +5,7 @@ use std::ffi::c_void;
 use std::rc::Rc;
 use std::sync::Arc;
 
+use bytes::Bytes;
 use khronos_egl as egl;
 use mujoco_rs::prelude::*;
 use protocol::Image;
@@ -65,7 +66,7 @@ impl Camera {
     pub fn image(&mut self, data: &mut MjData<Arc<MjModel>>) -> Result<Image, Fault> {
         match &mut self.0 {
             Some(renderer) => renderer.image(data),
-            None => Ok(Image { height: 0, width: 0, pixels: Vec::new() }),
+            None => Ok(Image { height: 0, width: 0, pixels: Bytes::new() }),
         }
     }
 }
@@ -125,7 +126,7 @@ impl Renderer {
         // OpenGL's rows start at the bottom.
         let mut pixels = Vec::with_capacity(upwards.len());
         upwards.chunks_exact(row).rev().for_each(|line| pixels.extend_from_slice(line));
-        Ok(Image { height, width, pixels })
+        Ok(Image { height, width, pixels: pixels.into() })
     }
 }
 

@@ -1,5 +1,6 @@
 //! What a policy sees before a decision.
 
+use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use super::{single, value};
@@ -14,8 +15,7 @@ pub struct Image {
     /// Columns.
     pub width: usize,
     /// height × width × 3 bytes: rows from the top, red green blue.
-    #[serde(with = "serde_bytes")]
-    pub pixels: Vec<u8>,
+    pub pixels: Bytes,
 }
 
 /// Everything that a policy may know, and on request the expert's opinion.

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use super::{Observation, Statistics, single, value};
@@ -122,7 +123,7 @@ impl Message for Reply {
     const NAME: &'static str = "reply";
     const BYTES_MAX: usize = REPLY_BYTES_MAX;
 
-    fn bulk(&mut self) -> Option<&mut Vec<u8>> {
+    fn bulk(&mut self) -> Option<&mut Bytes> {
         match self {
             Reply::Observed { observation, .. }
             | Reply::Restored { observation, .. }

@@ -1,5 +1,6 @@
 //! A newly trained verifier on its way to the agents.
 
+use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use super::value;
@@ -17,15 +18,14 @@ pub struct VerifierUpdate {
     /// Digest of the policy whose hidden states it reads; agents with another policy ignore it.
     pub policy: String,
     /// A safetensors file.
-    #[serde(with = "serde_bytes")]
-    pub weights: Vec<u8>,
+    pub weights: Bytes,
 }
 
 impl Message for VerifierUpdate {
     const NAME: &'static str = "verifier update";
     const BYTES_MAX: usize = VERIFIER_UPDATE_BYTES_MAX;
 
-    fn bulk(&mut self) -> Option<&mut Vec<u8>> {
+    fn bulk(&mut self) -> Option<&mut Bytes> {
         Some(&mut self.weights)
     }
 

@@ -41,7 +41,7 @@ impl Golden {
     fn image(&self, name: &str) -> Result<Image> {
         let tensor = self.tensor(name)?;
         let (height, width, _) = tensor.dims3()?;
-        Ok(Image { height, width, pixels: tensor.flatten_all()?.to_vec1()? })
+        Ok(Image { height, width, pixels: tensor.flatten_all()?.to_vec1()?.into() })
     }
 }
 

@@ -219,7 +219,7 @@ fn requests_that_cannot_be_answered_are_refused_in_words() -> Result<()> {
         request(&large, 1, 1.0, 0),
         "image: expected 32 x 32 pixels, got 64 x 64; ask the server for that size",
     );
-    let short = Image { pixels: vec![0; 5], ..good.clone() };
+    let short = Image { pixels: vec![0; 5].into(), ..good.clone() };
     check(request(&short, 1, 1.0, 0), "image: expected 3072 bytes, got 5");
     check(request(&good, 0, 1.0, 0), "candidates: expected at least 1, got 0");
     check(request(&good, 1, -1.0, 0), "temperature: expected 0 or more, got -1");
