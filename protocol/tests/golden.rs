@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 use std::fmt::Debug;
 use std::path::{Path, PathBuf};
 
-use protocol::{Message, decode, encode};
+use bytes::Bytes;
+use protocol::{Message, decode, decode_shared, encode};
 
 use crate::examples;
 
@@ -26,6 +27,12 @@ fn check<M: Message + Debug + PartialEq>(name: &str, message: &M) -> String {
     let golden = std::fs::read(&file).expect("every example has a golden file");
     assert_eq!(golden, bytes, "{name}: encoded bytes differ from the golden file");
     assert_eq!(&decode::<M>(&golden).expect(name), message, "{name}");
+    let shared = Bytes::from(golden.clone());
+    let mut read = decode_shared::<M>(&shared).expect(name);
+    assert_eq!(&read, message, "{name}");
+    if let Some(bulk) = read.bulk() {
+        assert!(shared.as_ptr_range().contains(&bulk.as_ptr()), "{name}: its bulk was copied");
+    }
     for length in 0..golden.len() {
         assert!(decode::<M>(&golden[..length]).is_err(), "{name}: accepted {length} bytes of it");
     }
