@@ -2,7 +2,7 @@
 //!
 //! A server that is asked the same again sends the same reply again, image and all, without simulating anything. So
 //! steps and repetitions, in turns, tell the wire from the world: request, queue, reply and decoding are in both. What a
-//! repetition leaves out is the encoding of the reply in the server, one copy of an image.
+//! repetition leaves out is the encoding of the reply in the server, which copies the image.
 
 use std::time::{Duration, Instant};
 
