@@ -54,14 +54,17 @@ fn a_benchmark_of_the_wire_takes_steps_and_repeated_replies_in_turns() {
     let file = folder.path().join("bench.json");
     let mut bench = rever();
     bench.args(["bench", "wire", "--sessions", "1,5", "--steps", "60", "--side", "64", "--json"]);
-    succeed(bench.arg(&file));
+    let table = succeed(bench.arg(&file));
     let rows = rows(&file);
-    let steps: Vec<_> = rows.iter().map(|row| row["steps"].as_u64()).collect();
+    let counts: Vec<_> =
+        rows.iter().map(|row| (row["simulator"].as_str(), row["steps"].as_u64())).collect();
     // 60 steps of each session; an episode that is over is begun anew.
-    assert_eq!(steps, [60, 300].map(Some));
+    let expected = [("native", 60), ("native", 300), ("python", 60), ("python", 300)];
+    assert_eq!(counts, expected.map(|(simulator, steps)| (Some(simulator), Some(steps))));
     for row in rows {
-        assert!(row["wire_ms_p50"].as_f64() > Some(0.0), "{row}");
-        assert!(row["step_ms_p50"].as_f64() > Some(0.0), "{row}");
+        let figure = |name: &str| row[name].as_f64().expect("a number");
+        assert!(figure("wire_ms_p50") > 0.0 && figure("step_ms_p50") > 0.0, "{row}");
+        assert!(table.contains(&format!("{:.3}", figure("wire_ms_p50"))), "{table}");
     }
 }
 

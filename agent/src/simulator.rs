@@ -1,17 +1,20 @@
 //! The simulators whose servers can be started on this machine, and what each needs before that.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, ensure};
 use clap::ValueEnum;
+use serde::Serialize;
 use serde_json::Value;
 
 use crate::setup::{self, PythonEnvironment};
 use crate::suite::TASKS;
 
 /// One of ours. `Python` and `Native` give the same bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Simulator {
     /// `python -m rever_env serve`.
     #[default]
@@ -36,6 +39,14 @@ pub enum ServerProgram {
         /// Scenes and tasks.toml.
         assets: PathBuf,
     },
+}
+
+impl fmt::Display for Simulator {
+    /// As the command line has it.
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let value = self.to_possible_value();
+        formatter.write_str(value.as_ref().map_or("", |value| value.get_name()))
+    }
 }
 
 impl ServerProgram {

@@ -12,6 +12,7 @@ use serde::Serialize;
 use tokio::task::JoinSet;
 
 use super::quantile;
+use crate::simulator::Simulator;
 use crate::site::Site;
 use crate::suite::{SeedRange, TASKS, VARIANT_DEFAULT};
 use crate::wire::{Environment, EnvironmentFault, Episode, Network};
@@ -28,6 +29,8 @@ pub(super) const SERVER_WAIT: Duration = Duration::from_secs(30);
 /// One number of sessions on one server, all of them asking at once.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
+    /// What the server is.
+    pub simulator: Simulator,
     /// Sessions of the server.
     pub sessions: usize,
     /// Of all sessions, counted.
@@ -104,6 +107,7 @@ impl WireBench<'_> {
         stepped.sort_by(f64::total_cmp);
         repeated.sort_by(f64::total_cmp);
         let row = Row {
+            simulator: self.site.simulator,
             sessions,
             steps: self.steps * sessions,
             step_ms_p50: quantile(&stepped, 0.5),

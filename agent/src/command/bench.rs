@@ -102,9 +102,9 @@ struct WireArguments {
     #[arg(long, value_delimiter = ',', default_value = "1,8,32",
           value_parser = clap::value_parser!(u16).range(1..=64))]
     sessions: Vec<u16>,
-    /// What the server is
-    #[arg(long, value_enum, default_value_t)]
-    simulator: Simulator,
+    /// What the server is, one after the other
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "native,python")]
+    simulator: Vec<Simulator>,
     #[command(flatten)]
     steps: StepsArguments,
 }
@@ -162,21 +162,24 @@ fn commit() -> String {
 }
 
 fn wire(arguments: WireArguments) -> Result<()> {
-    let site = site(1, arguments.simulator, arguments.steps.python.clone());
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
-    let steps = arguments.steps.steps as usize;
-    let rows =
-        WireBench { site: &site, sessions: &sessions, steps, side: arguments.steps.side }.run()?;
+    let (steps, side) = (arguments.steps.steps as usize, arguments.steps.side);
+    let mut rows = Vec::new();
+    for &simulator in &arguments.simulator {
+        let site = site(1, simulator, arguments.steps.python.clone());
+        rows.extend(WireBench { site: &site, sessions: &sessions, steps, side }.run()?);
+    }
     if let Some(path) = &arguments.steps.json {
-        write_json(path, serde_json::json!({ "side": arguments.steps.side, "rows": rows }))?;
+        write_json(path, serde_json::json!({ "side": side, "rows": rows }))?;
     }
     println!(
-        "{:>8} {:>7} {:>9} {:>9} {:>9} {:>8}",
-        "sessions", "steps", "step ms", "wire ms", "wire p95", "share"
+        "{:>9} {:>8} {:>7} {:>9} {:>9} {:>9} {:>8}",
+        "simulator", "sessions", "steps", "step ms", "wire ms", "wire p95", "share"
     );
     for row in rows {
         println!(
-            "{:>8} {:>7} {:>9.3} {:>9.3} {:>9.3} {:>6.1} %",
+            "{:>9} {:>8} {:>7} {:>9.3} {:>9.3} {:>9.3} {:>6.1} %",
+            row.simulator.to_string(),
             row.sessions,
             row.steps,
             row.step_ms_p50,
@@ -185,7 +188,7 @@ fn wire(arguments: WireArguments) -> Result<()> {
             100.0 * row.wire_ms_p50 / row.step_ms_p50
         );
     }
-    println!("one server, {0} x {0} pixels; per step, medians", arguments.steps.side);
+    println!("one server of each, {side} x {side} pixels; per step, medians");
     Ok(())
 }
 
