@@ -25,6 +25,14 @@ pub enum Simulator {
     Robosuite,
 }
 
+impl fmt::Display for Simulator {
+    /// As the command line has it.
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let value = self.to_possible_value();
+        formatter.write_str(value.as_ref().map_or("", |value| value.get_name()))
+    }
+}
+
 /// A program that serves worlds, ready to be started.
 #[derive(Debug, Clone)]
 pub enum ServerProgram {
@@ -39,14 +47,6 @@ pub enum ServerProgram {
         /// Scenes and tasks.toml.
         assets: PathBuf,
     },
-}
-
-impl fmt::Display for Simulator {
-    /// As the command line has it.
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let value = self.to_possible_value();
-        formatter.write_str(value.as_ref().map_or("", |value| value.get_name()))
-    }
 }
 
 impl ServerProgram {

@@ -102,7 +102,7 @@ struct WireArguments {
     #[arg(long, value_delimiter = ',', default_value = "1,8,32",
           value_parser = clap::value_parser!(u16).range(1..=64))]
     sessions: Vec<u16>,
-    /// What the server is, one after the other
+    /// What the server is, one after the other, separated by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "native,python")]
     simulator: Vec<Simulator>,
     #[command(flatten)]
