@@ -11,6 +11,7 @@ import pytest
 
 from rever_env import protocol
 from rever_env.protocol import Keys
+from rever_env.protocol.request import step_in_layout
 
 GOLDEN = Path(__file__).resolve().parents[2] / "protocol" / "golden"
 REFUSED: dict[str, dict[str, str]] = json.loads((GOLDEN / "refused" / "index.json").read_text())
@@ -163,29 +164,58 @@ def test_flipped_bytes_are_refused_or_read_as_a_valid_message(name: str) -> None
             assert len(protocol.REQUEST.encode(message)) == len(golden)
 
 
-def test_the_short_way_of_reading_tells_the_same_as_the_strict_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def told(data: bytes) -> object:
-        try:
-            return protocol.REQUEST.decode(data)
-        except protocol.CodecError as error:
-            return type(error), str(error), repr(getattr(error, "message", None))
+STRICT: protocol.Codec[protocol.Request] = protocol.Codec(
+    "request",
+    protocol.limits.REQUEST_BYTES_MAX,
+    {
+        kind.__name__: kind
+        for kind in (protocol.Reset, protocol.Step, protocol.Save, protocol.Restore, protocol.Close)
+    },
+)
 
+
+def _told(codec: protocol.Codec[protocol.Request], data: bytes) -> object:
+    try:
+        return codec.decode(data)
+    except protocol.CodecError as error:
+        return type(error), str(error), repr(getattr(error, "message", None))
+
+
+@pytest.mark.parametrize("sequence", [1, 127, 128, 255, 256, 65535, 65536, (1 << 32) - 1])
+@pytest.mark.parametrize("count", [1, 7, 15])
+def test_a_step_is_read_by_its_layout(sequence: int, count: int) -> None:
+    step = protocol.Step(sequence, tuple(np.linspace(-1.5, 1.5, count, dtype=np.float32).tolist()))
+    data = protocol.REQUEST.encode(step)
+    assert step_in_layout(data) == step == STRICT.decode(data)
+
+
+def test_the_layout_tells_the_same_as_the_strict_way() -> None:
+    cases = [
+        # 64 bits, and too large for 32
+        msgpack.packb({"Step": {"sequence": 2, "action": [1e300]}}),
+        protocol.REQUEST.encode(protocol.Step(1 << 32, (0.5,) * 7)),
+        protocol.REQUEST.encode(protocol.Step(9, (0.5,) * 16)),
+    ]
+    for sequence in (5, 200, 300, 70_000):
+        data = protocol.REQUEST.encode(protocol.Step(sequence, (0.5, -1.0)))
+        changed = [
+            data[:place] + bytes([byte]) + data[place + 1 :]
+            for place in range(len(data))
+            for byte in range(256)
+        ]
+        cases += [data[:-1], data + b"\0", *changed]
     random = np.random.default_rng(0)
-    step = {"sequence": 2, "action": [1e300]}  # 64 bits, and too large for 32
-    cases = [msgpack.packb({"Step": step})]
     for file in (*GOLDEN.glob("request_*.msgpack"), *GOLDEN.glob("refused/*.msgpack")):
         golden = file.read_bytes() or b"x"
         for _ in range(300):
-            data = bytearray(golden)
-            for place in random.integers(0, len(data), random.integers(0, 3)):
-                data[place] = random.integers(0, 256)
-            cases.append(bytes(data))
-    short = [told(data) for data in cases]
-    monkeypatch.setattr("rever_env.protocol.codec._SMALL_BYTES", -1)
-    assert [told(data) for data in cases] == short
-    assert sum(not isinstance(answer, tuple) for answer in short) > 100
+            mutated = bytearray(golden)
+            for place in random.integers(0, len(mutated), random.integers(0, 3)):
+                mutated[place] = random.integers(0, 256)
+            cases.append(bytes(mutated))
+    strict = [_told(STRICT, data) for data in cases]
+    assert [_told(protocol.REQUEST, data) for data in cases] == strict
+    read = sum(step_in_layout(data) is not None for data in cases)
+    assert 1000 < read < sum(not isinstance(answer, tuple) for answer in strict)
 
 
 def test_a_field_in_another_order_is_read() -> None:

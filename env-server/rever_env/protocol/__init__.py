@@ -25,7 +25,15 @@ from rever_env.protocol.reply import (
     Stepped,
     Transition,
 )
-from rever_env.protocol.request import Close, Request, Reset, Restore, Save, Step
+from rever_env.protocol.request import (
+    Close,
+    Request,
+    Reset,
+    Restore,
+    Save,
+    Step,
+    step_in_layout,
+)
 from rever_env.protocol.statistics import Statistics
 from rever_env.protocol.value import recognise_protocol
 from rever_env.protocol.verifier_update import VerifierUpdate
@@ -87,6 +95,7 @@ REQUEST: Codec[Request] = Codec(
     "request",
     limits.REQUEST_BYTES_MAX,
     {kind.__name__: kind for kind in (Reset, Step, Save, Restore, Close)},
+    in_layout=step_in_layout,
 )
 REPLY: Codec[Reply] = Codec(
     "reply",

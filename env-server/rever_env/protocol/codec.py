@@ -19,8 +19,6 @@ from rever_env.protocol import structure
 Reader = Callable[[object], Any]
 Writer = Callable[[Any], object]
 
-_SMALL_BYTES = 1024  # beyond, a second copy of the bytes would cost more than it spares
-
 
 class CodecError(ValueError):
     """A message was not written or not read."""
@@ -60,7 +58,11 @@ M = TypeVar("M", bound=Message)
 
 
 class Codec(Generic[M]):
-    """Writes and reads one kind of message, or one of several variants under their names."""
+    """Writes and reads one kind of message, or one of several variants under their names.
+
+    in_layout: a short way to read what comes often. It gives what the long way would give, or None
+    where it cannot tell, as for whatever is wrong, which the long way names.
+    """
 
     def __init__(
         self,
@@ -68,10 +70,12 @@ class Codec(Generic[M]):
         bytes_max: int,
         content: type[M] | Mapping[str, type[M]],
         recognise: Callable[[object], None] | None = None,
+        in_layout: Callable[[bytes], M | None] | None = None,
     ) -> None:
         self.name = name
         self.bytes_max = bytes_max
         self._recognise = recognise
+        self._in_layout = in_layout
         self._reader: Reader
         self._writer: Writer
         if isinstance(content, type):
@@ -88,29 +92,11 @@ class Codec(Generic[M]):
 
     def decode(self, data: bytes) -> M:
         """The message in exactly these bytes."""
-        self.check_size(len(data))
-        message = self._as_written(data)
+        message = self._in_layout(data) if self._in_layout else None
         return self._strictly(data) if message is None else message
 
-    def _as_written(self, data: bytes) -> M | None:
-        """The message in bytes that are just what encode writes, as small ones nearly always are.
-
-        None of others, and of whatever is wrong, which _strictly finds and names: it looks at each
-        byte, which takes longer.
-        """
-        if len(data) > _SMALL_BYTES or self._recognise is not None:
-            return None
-        try:
-            value = msgpack.unpackb(data)
-            if msgpack.packb(value, use_single_float=True) != data:
-                return None
-            message: M = self._reader(value)
-            message.validate()
-        except (ValueError, OverflowError):
-            return None
-        return message
-
     def _strictly(self, data: bytes) -> M:
+        self.check_size(len(data))
         try:
             structure.check(data)
             value = msgpack.unpackb(data, object_pairs_hook=_once)
@@ -176,6 +162,7 @@ def _dataclass(kind: type[Any]) -> tuple[Reader, Writer]:
     names = [field.name for field in dataclasses.fields(kind)]
     fields = [(name, *_field(hints[name])) for name in names]
     expected = set(names)
+    rewritten = [(name, writer) for name, _, writer in fields if writer is not _as_it_is]
 
     def read(value: object) -> Any:
         if not isinstance(value, dict):
@@ -189,9 +176,17 @@ def _dataclass(kind: type[Any]) -> tuple[Reader, Writer]:
         return kind(*[reader(value[name]) for name, reader, _ in fields])
 
     def write(message: Any) -> object:
-        return {name: writer(getattr(message, name)) for name, _, writer in fields}
+        values = vars(message)  # in the order of the fields, for __init__ has set them
+        if not rewritten:
+            return values
+        return values | {name: writer(values[name]) for name, writer in rewritten}
 
     return read, write
+
+
+def _as_it_is(value: object) -> object:
+    """What msgpack writes as the protocol wants it."""
+    return value
 
 
 def _field(hint: Any) -> tuple[Reader, Writer]:
@@ -206,20 +201,22 @@ def _field(hint: Any) -> tuple[Reader, Writer]:
         reader, writer = _field(present)
         return (
             lambda value: None if value is None else reader(value),
-            lambda value: None if value is None else writer(value),
+            writer
+            if writer is _as_it_is
+            else lambda value: None if value is None else writer(value),
         )
     if origin is tuple and typing.get_args(hint)[0] is float:
-        return _floats, list
+        return _floats, _as_it_is
     if origin is tuple:
         return _tuple(*_field(typing.get_args(hint)[0]))
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return _dataclass(hint)
     if hint is int:
         bits = next((part.count for part in annotations if isinstance(part, Bits)), 64)
-        return _integer(bits), lambda value: value
+        return _integer(bits), _as_it_is
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
         return _enumeration(hint), lambda value: value.value
-    return _exactly(hint), lambda value: value
+    return _exactly(hint), _as_it_is
 
 
 def _integer(bits: int) -> Reader:
