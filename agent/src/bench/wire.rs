@@ -3,7 +3,12 @@
 //! A server that is asked the same again sends the same reply again, image and all, without simulating anything. So
 //! steps and repetitions, in turns, tell the wire from the world: request, queue, reply and decoding are in both. What a
 //! repetition leaves out is the encoding of the reply in the server, which copies the image.
+//!
+//! Beside them, in turns, as many bytes pass through a bare socket: what this machine takes for them at that hour.
 
+use std::io::{Read, Result as IoResult, Write};
+use std::os::unix::net::UnixStream;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
@@ -26,6 +31,11 @@ pub(super) const HOLD_STILL: [f32; 7] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 /// The local server is on the network already.
 pub(super) const SERVER_WAIT: Duration = Duration::from_secs(30);
 
+/// A Step as it is sent.
+const REQUEST_BYTES: usize = 62;
+/// A Stepped without its picture, about.
+const REPLY_REST_BYTES: usize = 400;
+
 /// One number of sessions on one server, all of them asking at once.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
@@ -41,6 +51,8 @@ pub struct Row {
     pub wire_ms_p50: f64,
     /// The slow ones.
     pub wire_ms_p95: f64,
+    /// One request's and one reply's bytes through a socket between two threads, median.
+    pub bare_ms_p50: f64,
 }
 
 /// What is timed.
@@ -84,7 +96,9 @@ impl WireBench<'_> {
     /// Steps and repetitions of these sessions in turns.
     async fn count(&self, environments: Vec<Environment>) -> Result<(Row, Vec<Environment>)> {
         let sessions = environments.len();
-        let (mut stepped, mut repeated) = (Vec::new(), Vec::new());
+        let mut socket = BareSocket::open(3 * (self.side as usize).pow(2) + REPLY_REST_BYTES)
+            .context("cannot open a socket")?;
+        let (mut stepped, mut repeated, mut bare) = (Vec::new(), Vec::new(), Vec::new());
         let mut episodes = reset(environments).await?;
         for index in 0..WARM_UP_STEPS + self.steps {
             if index % EPISODE_STEPS == EPISODE_STEPS - 1 {
@@ -99,13 +113,16 @@ impl WireBench<'_> {
             })
             .await?;
             episodes = after;
+            let bare_ms = socket.exchange().context("the socket's other end is gone")?;
             if index >= WARM_UP_STEPS {
                 stepped.push(step_ms);
                 repeated.push(wire_ms);
+                bare.push(bare_ms);
             }
         }
-        stepped.sort_by(f64::total_cmp);
-        repeated.sort_by(f64::total_cmp);
+        for times in [&mut stepped, &mut repeated, &mut bare] {
+            times.sort_by(f64::total_cmp);
+        }
         let row = Row {
             simulator: self.site.simulator,
             sessions,
@@ -113,8 +130,36 @@ impl WireBench<'_> {
             step_ms_p50: quantile(&stepped, 0.5),
             wire_ms_p50: quantile(&repeated, 0.5),
             wire_ms_p95: quantile(&repeated, 0.95),
+            bare_ms_p50: quantile(&bare, 0.5),
         };
         Ok((row, episodes.into_iter().map(Episode::finish).collect()))
+    }
+}
+
+/// A thread that gives a reply's bytes for a request's bytes; it ends with this.
+struct BareSocket {
+    stream: UnixStream,
+    reply: Vec<u8>,
+}
+
+impl BareSocket {
+    fn open(reply_bytes: usize) -> IoResult<Self> {
+        let (stream, mut other) = UnixStream::pair()?;
+        let reply = vec![0; reply_bytes];
+        let sent = reply.clone();
+        thread::spawn(move || {
+            let mut request = [0; REQUEST_BYTES];
+            while other.read_exact(&mut request).is_ok() && other.write_all(&sent).is_ok() {}
+        });
+        Ok(Self { stream, reply })
+    }
+
+    /// Milliseconds of one exchange. Blocks.
+    fn exchange(&mut self) -> IoResult<f64> {
+        let begun = Instant::now();
+        self.stream.write_all(&[0; REQUEST_BYTES])?;
+        self.stream.read_exact(&mut self.reply)?;
+        Ok(begun.elapsed().as_secs_f64() * 1e3)
     }
 }
 

@@ -173,22 +173,25 @@ fn wire(arguments: WireArguments) -> Result<()> {
         write_json(path, serde_json::json!({ "side": side, "rows": rows }))?;
     }
     println!(
-        "{:>9} {:>8} {:>7} {:>9} {:>9} {:>9} {:>8}",
-        "simulator", "sessions", "steps", "step ms", "wire ms", "wire p95", "share"
+        "{:>9} {:>8} {:>7} {:>9} {:>9} {:>9} {:>9} {:>8}",
+        "simulator", "sessions", "steps", "step ms", "wire ms", "wire p95", "bare ms", "share"
     );
     for row in rows {
         println!(
-            "{:>9} {:>8} {:>7} {:>9.3} {:>9.3} {:>9.3} {:>6.1} %",
+            "{:>9} {:>8} {:>7} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>6.1} %",
             row.simulator.to_string(),
             row.sessions,
             row.steps,
             row.step_ms_p50,
             row.wire_ms_p50,
             row.wire_ms_p95,
+            row.bare_ms_p50,
             100.0 * row.wire_ms_p50 / row.step_ms_p50
         );
     }
-    println!("one server of each, {side} x {side} pixels; per step, medians");
+    println!(
+        "one server of each, {side} x {side} pixels; per step, medians; bare: one step's bytes through a socket, in turns"
+    );
     Ok(())
 }
 
