@@ -53,6 +53,7 @@ class _Lease:
     name: str
     session: Session
     publisher: Any
+    key: zenoh.KeyExpr
     declared: list[Any]
     opened_at: float
     used_at: float
@@ -232,9 +233,11 @@ class Server:
             reliability=zenoh.Reliability.RELIABLE,
             express=True,
         )
+        # zenoh knows the key by a number then, and need not match each request with the inbox.
+        key = self._network.declare_keyexpr(self._keys.request(name))
         now = time.monotonic()
-        lease = _Lease(name, session, publisher, [publisher], opened_at=now, used_at=now)
-        self._leases[self._keys.request(name)] = lease
+        lease = _Lease(name, session, publisher, key, [publisher], opened_at=now, used_at=now)
+        self._leases[str(key)] = lease
         look = self._enqueuing(lambda _: self._end_gone())
 
         def on_token(sample: Any) -> None:
@@ -281,6 +284,7 @@ class Server:
             lease.publisher.put(refused(0, f"session {lease.name} ended: {reason}"))
         for declaration in reversed(lease.declared):
             declaration.undeclare()
+        self._network.undeclare(lease.key)
         lease.session.end()
 
     def _heartbeat(self) -> protocol.Heartbeat:
