@@ -49,9 +49,9 @@ def length(field: str, values: Sized, low: int, high: int) -> None:
 
 def finite(field: str, values: tuple[float, ...]) -> None:
     """Numbers without NaN and infinity."""
-    if not all(map(math.isfinite, values)):
-        index, number = next(pair for pair in enumerate(values) if not math.isfinite(pair[1]))
-        raise ValueError(f"{field}: expected finite numbers, got {number} at index {index}")
+    for index, number in enumerate(values):
+        if not math.isfinite(number):
+            raise ValueError(f"{field}: expected finite numbers, got {number} at index {index}")
 
 
 def range(field: str, value: int, low: int, high: int) -> None:
