@@ -89,6 +89,8 @@ class Server:
         self._pending_max = (options.sessions_max + 1) * _PENDING_PER_SESSION_MAX
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._ticks: collections.deque[float] = collections.deque(maxlen=self._pending_max)
+        self._waking = threading.Lock()
+        self._ended = False  # under _waking; zenoh refuses to be closed while a thread puts
         self._description()  # worlds that cannot be described are refused now
 
     def run(self, stop: threading.Event, ready: Callable[[str], None]) -> None:
@@ -119,6 +121,8 @@ class Server:
             self._loop(stop, inbox, heartbeat)
         finally:
             ended.set()
+            with self._waking:
+                self._ended = True
             for declaration in reversed(declared):
                 declaration.undeclare()
             for key in list(self._leases):
@@ -155,12 +159,13 @@ class Server:
 
     def _wake(self, kind: str) -> None:
         """Puts a message of our own behind the requests in the inbox."""
-        with contextlib.suppress(zenoh.ZError):  # the network is closed: nobody waits any more
-            self._network.put(
-                self._keys.request(self._named(kind)),
-                b"",
-                allowed_destination=zenoh.Locality.SESSION_LOCAL,
-            )
+        with self._waking, contextlib.suppress(zenoh.ZError):  # a closed network: nobody waits
+            if not self._ended:
+                self._network.put(
+                    self._keys.request(self._named(kind)),
+                    b"",
+                    allowed_destination=zenoh.Locality.SESSION_LOCAL,
+                )
 
     def _named(self, name: str) -> str:
         """What the inbox takes for one of this server's sessions."""

@@ -5,7 +5,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import zenoh
 from conftest import free_endpoint
 
 from rever_env import protocol, tasks, world
+from rever_env.server import Server, ServerOptions
 from rever_env.serving import Endpoints
 from rever_env.session import Session
 from rever_env.worlds import UnknownTask, Worlds
@@ -237,6 +239,33 @@ def test_a_server_describes_itself_and_ends_on_a_signal() -> None:
         assert {task.task for task in description.tasks} == tasks.load().keys()
         process.send_signal(signal.SIGTERM)
         assert process.wait(WAIT_SECS) == 0
+
+
+def started(thread: threading.Thread) -> Callable[[str], None]:
+    """Starts the thread when the server is ready."""
+    return lambda _: thread.start()
+
+
+def test_a_network_can_be_closed_after_a_server_that_was_being_asked(worlds: Worlds) -> None:
+    endpoint = free_endpoint()
+    here = Endpoints((), (endpoint,), False).configuration()
+    there = Endpoints((endpoint,), (), False).configuration()
+    with zenoh.open(zenoh.Config.from_json5(here)) as asker:
+        for _ in range(20):
+            stop = threading.Event()
+
+            def ask_on(name: str, stop: threading.Event = stop) -> None:
+                for count in range(500):
+                    asker.get(f"rever/1/local/server/{name}/describe", timeout=WAIT_SECS)
+                    if count == 100:
+                        stop.set()
+
+            # zenoh refuses to close what another thread still uses.
+            with zenoh.open(zenoh.Config.from_json5(there)) as network:
+                server = Server(network, worlds, ServerOptions())
+                thread = threading.Thread(target=ask_on, args=(server.id,))
+                server.run(stop, started(thread))
+            thread.join()
 
 
 def test_a_server_ends_with_its_parent() -> None:
