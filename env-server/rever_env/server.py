@@ -90,7 +90,7 @@ class Server:
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._ticks: collections.deque[float] = collections.deque(maxlen=self._pending_max)
         self._waking = threading.Lock()
-        self._ended = False  # under _waking; zenoh refuses to be closed while a thread puts
+        self._ended = False  # set under _waking: zenoh refuses to be closed while a thread puts
         self._description()  # worlds that cannot be described are refused now
 
     def run(self, stop: threading.Event, ready: Callable[[str], None]) -> None:
@@ -115,12 +115,10 @@ class Server:
         declared.append(heartbeat)
         declared.append(self._network.liveliness().declare_token(self._keys.server(self.id)))
         ready(self.id)
-        ended = threading.Event()
-        threading.Thread(target=self._tick, args=(stop, ended), name="clock", daemon=True).start()
+        threading.Thread(target=self._tick, args=(stop,), name="clock", daemon=True).start()
         try:
             self._loop(stop, inbox, heartbeat)
         finally:
-            ended.set()
             with self._waking:
                 self._ended = True
             for declaration in reversed(declared):
@@ -147,12 +145,12 @@ class Server:
                     heartbeat.put(protocol.HEARTBEAT.encode(self._heartbeat()))
                     beat_at = time.monotonic() + _BEAT_SECS / 2
 
-    def _tick(self, stop: threading.Event, ended: threading.Event) -> None:
+    def _tick(self, stop: threading.Event) -> None:
         """Tells the simulation thread that time passes, and at once when stop is set."""
         stopped = False
         while not stopped:
             stopped = stop.wait(_BEAT_SECS)
-            if ended.is_set():
+            if self._ended:
                 return
             self._ticks.append(time.monotonic())
             self._wake(_TICK)

@@ -2,7 +2,8 @@
 //!
 //! A server that is asked the same again sends the same reply again, image and all, without simulating anything. So
 //! steps and repetitions, in turns, tell the wire from the world: request, queue, reply and decoding are in both. What a
-//! repetition leaves out is the encoding of the reply in the server, which copies the image.
+//! repetition leaves out is the encoding of the reply in the server, which copies the image, and what having waited for
+//! the simulator costs both sides (measured in `agent/LOG.md`, 2026-11-27).
 //!
 //! Beside them, in turns, as many bytes pass through a bare socket: what this machine takes for them at that hour.
 
