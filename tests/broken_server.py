@@ -127,6 +127,15 @@ def other_size() -> None:
         original(self, replace(opened, image_height=opened.image_width), worlds)
 
 
+def overstates_time() -> None:
+    @wrap(Session, "_reply")
+    def reply(original: Any, self: Any, request: protocol.Request) -> Any:
+        answer = original(self, request)
+        if isinstance(answer, protocol.Stepped):
+            return replace(answer, simulator_us=answer.simulator_us * 1000)
+        return answer
+
+
 def any_length() -> None:
     @wrap(World, "step")
     def step(original: Any, self: Any, action: Any) -> Any:
@@ -150,6 +159,7 @@ DEFECTS = {
         no_limit,
         forgets_close,
         other_size,
+        overstates_time,
         any_length,
     )
 }

@@ -91,6 +91,11 @@ async fn trajectory(network: &Network, server: &str) -> Result<Vec<Vec<u8>>, Env
         encode(&Reply::Observed { sequence: 1, observation: observation.clone() })
             .expect("a valid observation")
     };
+    // How long a step took is not a part of what happened.
+    let stepped = |transition| {
+        encode(&Reply::Stepped { sequence: 1, transition, simulator_us: 0 })
+            .expect("a valid transition")
+    };
     bytes.push(observed(episode.observation()));
     for step in 0..12 {
         if step == 6 {
@@ -98,15 +103,13 @@ async fn trajectory(network: &Network, server: &str) -> Result<Vec<Vec<u8>>, Env
         }
         let action = episode.expert_action().expect("the expert was asked for");
         let transition = episode.step(action).await?;
-        bytes
-            .push(encode(&Reply::Stepped { sequence: 1, transition }).expect("a valid transition"));
+        bytes.push(stepped(transition));
     }
     episode.restore(2).await?;
     bytes.push(observed(episode.observation()));
     for _ in 0..3 {
         let transition = episode.step([0.01, 0.0, -0.005, 0.0, 0.0, 0.1, 1.0]).await?;
-        bytes
-            .push(encode(&Reply::Stepped { sequence: 1, transition }).expect("a valid transition"));
+        bytes.push(stepped(transition));
     }
     let episode = episode.finish().reset(reset("widowx_stack_cube", None)).await?;
     bytes.push(observed(episode.observation()));
@@ -280,7 +283,7 @@ async fn what_no_client_of_ours_would_send_is_refused_in_words() {
             .expect("the golden file is there")
     };
     let replies = stranger
-        .declare_subscriber(format!("rever/1/strange/session/{session}/reply"))
+        .declare_subscriber(format!("rever/2/strange/session/{session}/reply"))
         .await
         .expect("a subscriber");
     for (request, sequence, words) in [
@@ -294,7 +297,7 @@ async fn what_no_client_of_ours_would_send_is_refused_in_words() {
         (golden("request_restore.msgpack"), 70_000, "sequence: expected 3, got 70000"),
     ] {
         stranger
-            .put(format!("rever/1/strange/session/{session}/request"), request)
+            .put(format!("rever/2/strange/session/{session}/request"), request)
             .await
             .expect("sent");
         let sample = tokio::time::timeout(WAIT, replies.recv_async())
@@ -310,11 +313,11 @@ async fn what_no_client_of_ours_would_send_is_refused_in_words() {
     for (payload, words) in [
         (
             golden("refused/protocol_and_fields.msgpack"),
-            "open is invalid: expected protocol 1, got protocol 2",
+            "open is invalid: expected protocol 2, got protocol 3",
         ),
         (vec![0xc0; 1025], "open has 1025 bytes, limit 1024"),
     ] {
-        let key = format!("rever/1/strange/server/{}/open", server.id);
+        let key = format!("rever/2/strange/server/{}/open", server.id);
         let answers = stranger.get(key).payload(payload).timeout(WAIT).await.expect("asked");
         let sample =
             answers.recv_async().await.expect("an answer").into_result().expect("a sample");

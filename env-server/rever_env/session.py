@@ -1,6 +1,7 @@
 """One leased session: its numbered requests, its world, its saved states."""
 
 import logging
+import time
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ from rever_env import protocol, world
 from rever_env.worlds import AnyWorld, Key, UnknownTask, Worlds
 
 _log = logging.getLogger(__name__)
+
+_SIMULATOR_US_MAX = 2**32 - 1  # what the reply has room for: over an hour
 
 
 class _Wrong(Exception):
@@ -91,9 +94,12 @@ class Session:
         if not self._running or self._world is None:
             raise _Wrong(f"expected Reset first, got {type(request).__name__}: no episode runs")
         if isinstance(request, protocol.Step):
-            transition = self._world.step(np.array(request.action, dtype=np.float64))
+            action = np.array(request.action, dtype=np.float64)
+            begun = time.perf_counter()
+            transition = self._world.step(action)
+            simulator_us = min(int((time.perf_counter() - begun) * 1e6), _SIMULATOR_US_MAX)
             self.steps += 1
-            return protocol.Stepped(request.sequence, self._transition(transition))
+            return protocol.Stepped(request.sequence, self._transition(transition), simulator_us)
         if isinstance(request, protocol.Save):
             self._slots[request.slot] = self._world.save()
             return protocol.Saved(request.sequence)

@@ -73,7 +73,7 @@ EXAMPLES: dict[str, Any] = {
         idle_secs_max=600,
     ),
     "heartbeat": protocol.Heartbeat("0123456789abcdef", 3, 70_000, 5_000_000_000),
-    "open": protocol.Open(1, SPOON, "default", 128, 128, True, "agent"),
+    "open": protocol.Open(protocol.PROTOCOL_VERSION, SPOON, "default", 128, 128, True, "agent"),
     "opening_opened": protocol.Opened("fedcba9876543210"),
     "opening_refused": protocol.OpenRefused("all 16 sessions are in use"),
     "request_reset": protocol.Reset(1, SPOON, "default", 23, 7),
@@ -83,7 +83,7 @@ EXAMPLES: dict[str, Any] = {
     "request_restore": protocol.Restore(70_000, 15),
     "request_close": protocol.Close(5_000_000_000),
     "reply_observed": protocol.Observed(1, OBSERVATION),
-    "reply_stepped": protocol.Stepped(2, TRANSITION),
+    "reply_stepped": protocol.Stepped(2, TRANSITION, 4250),
     "reply_saved": protocol.Saved(3),
     "reply_restored": protocol.Restored(4, OBSERVATION),
     "reply_closed": protocol.Closed(5),
@@ -249,16 +249,16 @@ def test_an_invalid_request_tells_its_number() -> None:
 
 def test_keys_lie_under_version_and_fleet() -> None:
     keys = Keys("home")
-    assert keys.server("s1") == "rever/1/home/server/s1"
-    assert keys.describe("s1") == "rever/1/home/server/s1/describe"
-    assert keys.open("s1") == "rever/1/home/server/s1/open"
-    assert keys.heartbeat("s1") == "rever/1/home/server/s1/heartbeat"
-    assert keys.session("a") == "rever/1/home/session/a"
-    assert keys.request("a") == "rever/1/home/session/a/request"
-    assert keys.requests("s1") == "rever/1/home/session/s1.$*/request"
-    assert keys.reply("a") == "rever/1/home/session/a/reply"
-    assert keys.outcome("run.1") == "rever/1/home/outcome/run.1"
-    assert keys.verifier("best_of-2") == "rever/1/home/verifier/best_of-2"
+    assert keys.server("s1") == "rever/2/home/server/s1"
+    assert keys.describe("s1") == "rever/2/home/server/s1/describe"
+    assert keys.open("s1") == "rever/2/home/server/s1/open"
+    assert keys.heartbeat("s1") == "rever/2/home/server/s1/heartbeat"
+    assert keys.session("a") == "rever/2/home/session/a"
+    assert keys.request("a") == "rever/2/home/session/a/request"
+    assert keys.requests("s1") == "rever/2/home/session/s1.$*/request"
+    assert keys.reply("a") == "rever/2/home/session/a/reply"
+    assert keys.outcome("run.1") == "rever/2/home/outcome/run.1"
+    assert keys.verifier("best_of-2") == "rever/2/home/verifier/best_of-2"
 
 
 @pytest.mark.parametrize("name", ["", "*", "**", "a/b", "a b", "$*", "a?b", "ä", "a" * 65, "a\n"])

@@ -23,7 +23,7 @@ from rever_env.worlds import UnknownTask, Worlds
 
 SPOON = "widowx_spoon_on_towel"
 CUBE = "widowx_stack_cube"
-OPEN = protocol.Open(1, SPOON, "default", 64, 64, True, "test")
+OPEN = protocol.Open(protocol.PROTOCOL_VERSION, SPOON, "default", 64, 64, True, "test")
 STILL = (0.0,) * 7
 WAIT_SECS = 60.0
 
@@ -150,7 +150,12 @@ def test_unknown_tasks_and_placements_are_refused(session: Session, worlds: Worl
     reply = ask(session, protocol.Reset(4, SPOON, "default", 24, 7))
     assert isinstance(reply, protocol.Refused)
     with pytest.raises(UnknownTask, match="got widowx_fold_towel"):
-        Session(protocol.Open(1, "widowx_fold_towel", "default", 64, 64, False, "test"), worlds)
+        Session(
+            protocol.Open(
+                protocol.PROTOCOL_VERSION, "widowx_fold_towel", "default", 64, 64, False, "test"
+            ),
+            worlds,
+        )
 
 
 def test_a_broken_world_is_a_fault_until_the_next_reset(
@@ -183,7 +188,7 @@ def test_a_defect_is_a_fault_and_not_an_outcome(
 
 def test_the_expert_speaks_only_when_asked(worlds: Worlds) -> None:
     for expert in (False, True):
-        opened = protocol.Open(1, SPOON, "default", 64, 64, expert, "test")
+        opened = protocol.Open(protocol.PROTOCOL_VERSION, SPOON, "default", 64, 64, expert, "test")
         session = Session(opened, worlds)
         reply = ask(session, protocol.Reset(1, SPOON, "default", 3, 7))
         assert isinstance(reply, protocol.Observed)
@@ -233,7 +238,7 @@ def test_a_server_describes_itself_and_ends_on_a_signal() -> None:
         name = ready.split()[1]
         configuration = Endpoints((endpoint,), (), False).configuration()
         with zenoh.open(zenoh.Config.from_json5(configuration)) as network:
-            for reply in network.get(f"rever/1/home/server/{name}/describe", timeout=WAIT_SECS):
+            for reply in network.get(protocol.Keys("home").describe(name), timeout=WAIT_SECS):
                 description = protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes())
         assert (description.server, description.sessions_max) == (name, 3)
         assert {task.task for task in description.tasks} == tasks.load().keys()
@@ -256,7 +261,7 @@ def test_a_network_can_be_closed_after_a_server_that_was_being_asked(worlds: Wor
 
             def ask_on(name: str, stop: threading.Event = stop) -> None:
                 for count in range(500):
-                    asker.get(f"rever/1/local/server/{name}/describe", timeout=WAIT_SECS)
+                    asker.get(protocol.Keys("local").describe(name), timeout=WAIT_SECS)
                     if count == 100:
                         stop.set()
 

@@ -118,7 +118,10 @@ pub fn replies() -> [(&'static str, Reply); 7] {
     let kind = FaultKind::PhysicsDiverged;
     [
         ("reply_observed", Reply::Observed { sequence: 1, observation: observation() }),
-        ("reply_stepped", Reply::Stepped { sequence: 2, transition: transition() }),
+        (
+            "reply_stepped",
+            Reply::Stepped { sequence: 2, transition: transition(), simulator_us: 4_250 },
+        ),
         ("reply_saved", Reply::Saved { sequence: 3 }),
         ("reply_restored", Reply::Restored { sequence: 4, observation: observation() }),
         ("reply_closed", Reply::Closed { sequence: 5 }),

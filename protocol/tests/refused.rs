@@ -265,7 +265,7 @@ fn number_cases() -> Vec<Case> {
 
 fn peer_cases() -> Vec<Case> {
     let mut future = valid(&Open { protocol: PROTOCOL_VERSION, ..examples::open() });
-    future = changed(future, b"protocol\x01", b"protocol\x02");
+    future = changed(future, b"protocol\x02", b"protocol\x03");
     let other_fields = changed(future.clone(), b"holder", b"owners");
     let pixels = examples::observation().image.pixels;
     let short = changed(
@@ -295,12 +295,12 @@ fn peer_cases() -> Vec<Case> {
             changed(described, &high_at(1.0), b"\xa4high\xc0"),
             "description is invalid: dimension gripper: expected whole bounds, for it is discrete",
         ),
-        case("protocol", "open", future, "open is invalid: expected protocol 1, got protocol 2"),
+        case("protocol", "open", future, "open is invalid: expected protocol 2, got protocol 3"),
         case(
             "protocol_and_fields",
             "open",
             other_fields,
-            "open is invalid: expected protocol 1, got protocol 2",
+            "open is invalid: expected protocol 2, got protocol 3",
         ),
         case(
             "image_bytes",

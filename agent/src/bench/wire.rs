@@ -1,11 +1,10 @@
 //! What a control step costs over the wire, beside what the simulator needs for it.
 //!
-//! A server that is asked the same again sends the same reply again, image and all, without simulating anything. So
-//! steps and repetitions, in turns, tell the wire from the world: request, queue, reply and decoding are in both. What a
-//! repetition leaves out is the encoding of the reply in the server, which copies the image, and what having waited for
-//! the simulator costs both sides (measured in `agent/LOG.md`, 2026-11-27).
+//! A reply to a step says what the simulator took for it; the rest of the round trip is the wire: request, queues, writing
+//! the reply, its picture's way, reading it.
 //!
-//! Beside them, in turns, as many bytes pass through a bare socket: what this machine takes for them at that hour.
+//! Beside each step, in turns: the same reply once more, which a server sends without simulating or writing anything, and
+//! as many bytes through a bare socket, which is what this machine takes for them at that hour.
 
 use std::io::{Read, Result as IoResult, Write};
 use std::os::unix::net::UnixStream;
@@ -48,10 +47,14 @@ pub struct Row {
     pub steps: usize,
     /// One control step with its image: the time of all sessions' steps over their number, median.
     pub step_ms_p50: f64,
-    /// A repeated reply, likewise.
+    /// What of it the simulator took, as the server says: median of the sessions' means.
+    pub simulator_ms_p50: f64,
+    /// The rest of it, median.
     pub wire_ms_p50: f64,
     /// The slow ones.
     pub wire_ms_p95: f64,
+    /// A repeated reply: the time of all sessions' repetitions over their number, median.
+    pub repeat_ms_p50: f64,
     /// One request's and one reply's bytes through a socket between two threads, median.
     pub bare_ms_p50: f64,
 }
@@ -99,7 +102,8 @@ impl WireBench<'_> {
         let sessions = environments.len();
         let mut socket = BareSocket::open(3 * (self.side as usize).pow(2) + REPLY_REST_BYTES)
             .context("cannot open a socket")?;
-        let (mut stepped, mut repeated, mut bare) = (Vec::new(), Vec::new(), Vec::new());
+        let [mut stepped, mut simulated, mut wire, mut repeated, mut bare] =
+            [const { Vec::new() }; 5];
         let mut episodes = reset(environments).await?;
         for index in 0..WARM_UP_STEPS + self.steps {
             if index % EPISODE_STEPS == EPISODE_STEPS - 1 {
@@ -109,7 +113,9 @@ impl WireBench<'_> {
                 episode.step(HOLD_STILL).await.map(|_| episode)
             })
             .await?;
-            let (wire_ms, after) = at_once(after, |mut episode: Episode| async move {
+            let in_simulator = after.iter().map(Episode::simulator_time).sum::<Duration>();
+            let simulator_ms = in_simulator.as_secs_f64() * 1e3 / sessions as f64;
+            let (repeat_ms, after) = at_once(after, |mut episode: Episode| async move {
                 episode.repeat().await.map(|()| episode)
             })
             .await?;
@@ -117,11 +123,13 @@ impl WireBench<'_> {
             let bare_ms = socket.exchange().context("the socket's other end is gone")?;
             if index >= WARM_UP_STEPS {
                 stepped.push(step_ms);
-                repeated.push(wire_ms);
+                simulated.push(simulator_ms);
+                wire.push(step_ms - simulator_ms);
+                repeated.push(repeat_ms);
                 bare.push(bare_ms);
             }
         }
-        for times in [&mut stepped, &mut repeated, &mut bare] {
+        for times in [&mut stepped, &mut simulated, &mut wire, &mut repeated, &mut bare] {
             times.sort_by(f64::total_cmp);
         }
         let row = Row {
@@ -129,8 +137,10 @@ impl WireBench<'_> {
             sessions,
             steps: self.steps * sessions,
             step_ms_p50: quantile(&stepped, 0.5),
-            wire_ms_p50: quantile(&repeated, 0.5),
-            wire_ms_p95: quantile(&repeated, 0.95),
+            simulator_ms_p50: quantile(&simulated, 0.5),
+            wire_ms_p50: quantile(&wire, 0.5),
+            wire_ms_p95: quantile(&wire, 0.95),
+            repeat_ms_p50: quantile(&repeated, 0.5),
             bare_ms_p50: quantile(&bare, 0.5),
         };
         Ok((row, episodes.into_iter().map(Episode::finish).collect()))

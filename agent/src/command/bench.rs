@@ -95,7 +95,7 @@ struct ThroughputArguments {
     json: Option<PathBuf>,
 }
 
-/// Control steps over the wire beside repeated replies, which cost the wire and no simulator
+/// Control steps over the wire, less what the simulator took for them, beside repeated replies
 #[derive(Debug, Args)]
 struct WireArguments {
     /// Sessions of one server that ask at once, separated by commas
@@ -173,24 +173,36 @@ fn wire(arguments: WireArguments) -> Result<()> {
         write_json(path, serde_json::json!({ "side": side, "rows": rows }))?;
     }
     println!(
-        "{:>9} {:>8} {:>7} {:>9} {:>9} {:>9} {:>9} {:>8}",
-        "simulator", "sessions", "steps", "step ms", "wire ms", "wire p95", "bare ms", "share"
+        "{:>9} {:>8} {:>7} {:>8} {:>12} {:>8} {:>8} {:>9} {:>8} {:>7}",
+        "simulator",
+        "sessions",
+        "steps",
+        "step ms",
+        "simulator ms",
+        "wire ms",
+        "wire p95",
+        "repeat ms",
+        "bare ms",
+        "share"
     );
     for row in rows {
         println!(
-            "{:>9} {:>8} {:>7} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>6.1} %",
+            "{:>9} {:>8} {:>7} {:>8.3} {:>12.3} {:>8.3} {:>8.3} {:>9.3} {:>8.3} {:>5.1} %",
             row.simulator.to_string(),
             row.sessions,
             row.steps,
             row.step_ms_p50,
+            row.simulator_ms_p50,
             row.wire_ms_p50,
             row.wire_ms_p95,
+            row.repeat_ms_p50,
             row.bare_ms_p50,
             100.0 * row.wire_ms_p50 / row.step_ms_p50
         );
     }
     println!(
-        "one server of each, {side} x {side} pixels; per step, medians; bare: one step's bytes through a socket, in turns"
+        "one server of each, {side} x {side} pixels; per step of all sessions, medians; wire: a step less its simulator's time; \
+         repeat: the same reply again; bare: as many bytes through a socket"
     );
     Ok(())
 }

@@ -1,5 +1,7 @@
 //! Episodes: what may come when, the same reset gives the same bytes, save and restore, the horizon.
 
+use std::time::Instant;
+
 use anyhow::{Result, bail, ensure};
 use protocol::{Open, Reply, Request, decode};
 
@@ -38,8 +40,15 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row(
             "deterministic",
-            "the same Reset and actions give the same bytes, in any session",
+            "the same Reset and actions give the same transitions, in any session",
             deterministic(subject),
+        )
+        .await;
+    table
+        .row(
+            "simulator_time",
+            "a step says what the simulator took for it, which is less than its round trip",
+            simulator_time(subject),
         )
         .await;
     table
@@ -132,7 +141,10 @@ fn unnumbered(talk: &Talk) -> Result<Reply> {
         Reply::Observed { observation, .. } | Reply::Restored { observation, .. } => {
             Reply::Observed { sequence: 1, observation }
         }
-        Reply::Stepped { transition, .. } => Reply::Stepped { sequence: 1, transition },
+        // How long it took is not a part of what happened.
+        Reply::Stepped { transition, .. } => {
+            Reply::Stepped { sequence: 1, transition, simulator_us: 0 }
+        }
         other => other,
     })
 }
@@ -178,6 +190,27 @@ async fn deterministic(subject: &Subject<'_>) -> Result<Tested> {
     let elsewhere = trajectory(&mut other, 0).await?;
     other.close().await?;
     equal(&first, &elsewhere)?;
+    Ok(Tested::Kept)
+}
+
+async fn simulator_time(subject: &Subject<'_>) -> Result<Tested> {
+    let mut talk = subject.episode(0).await?;
+    let mut said_us = 0;
+    for _ in 0..STEPS {
+        let asked_at = Instant::now();
+        talk.go().await?;
+        let round_trip_us = asked_at.elapsed().as_micros();
+        let Reply::Stepped { simulator_us, .. } = decode(&talk.reply)? else {
+            unreachable!("it was a step");
+        };
+        ensure!(
+            u128::from(simulator_us) <= round_trip_us,
+            "expected a simulator_us up to the round trip's {round_trip_us}, got {simulator_us}"
+        );
+        said_us += u64::from(simulator_us);
+    }
+    talk.close().await?;
+    ensure!(said_us > 0, "expected a simulator_us above 0 in one of {STEPS} steps, got none");
     Ok(Tested::Kept)
 }
 

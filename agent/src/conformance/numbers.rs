@@ -1,7 +1,7 @@
 //! Numbered requests on a wire that may lose, double and reorder them, and bytes that are no requests.
 
 use anyhow::{Result, ensure};
-use protocol::{Reply, Request, decode, encode, limits};
+use protocol::{Reply, Request, Transition, decode, encode, limits};
 
 use super::subject::{SILENCE, Subject, Talk, names, unchecked};
 use super::{Table, Tested};
@@ -33,8 +33,8 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
             let bytes = encode(&Request::Step { sequence: gap, action: subject.moving() })?;
             talk.refusal_of(&bytes, gap).await?;
             let expected = clean_step(subject, 0).await?;
-            talk.hold_still().await?;
-            ensure!(talk.reply == expected, "expected the reply of a session without the gap");
+            let got = talk.hold_still().await?;
+            ensure!(got == expected, "expected the step of a session without the gap");
             talk.close().await?;
             Ok(Tested::Kept)
         })
@@ -154,8 +154,9 @@ async fn discrete(subject: &Subject<'_>) -> Result<Tested> {
 
 async fn repeated(subject: &Subject<'_>) -> Result<Tested> {
     let mut talk = subject.episode(0).await?;
+    let mut steps = Vec::new();
     for _ in 0..2 {
-        talk.go().await?;
+        steps.push(talk.go().await?);
         for _ in 0..2 {
             let again = talk.answer_to(&talk.request.clone()).await?;
             ensure!(
@@ -165,12 +166,10 @@ async fn repeated(subject: &Subject<'_>) -> Result<Tested> {
             );
         }
     }
-    let twice = talk.reply.clone();
     talk.close().await?;
     let mut clean = subject.episode(0).await?;
-    clean.go().await?;
-    clean.go().await?;
-    ensure!(clean.reply == twice, "expected what a session without repetitions gives");
+    let expected = [clean.go().await?, clean.go().await?];
+    ensure!(steps == expected, "expected what a session without repetitions gives");
     clean.close().await?;
     Ok(Tested::Kept)
 }
@@ -189,24 +188,18 @@ fn described(bytes: &[u8]) -> String {
 
 /// What was refused has left the world as it was, and the session goes on.
 async fn unchanged(subject: &Subject<'_>, mut talk: Talk) -> Result<Tested> {
-    talk.hold_still().await?;
-    let (Reply::Stepped { transition: got, .. }, Reply::Stepped { transition: expected, .. }) =
-        (decode(&talk.reply)?, decode(&clean_step(subject, 0).await?)?)
-    else {
-        unreachable!("both were steps");
-    };
+    let (got, expected) = (talk.hold_still().await?, clean_step(subject, 0).await?);
     ensure!(got == expected, "expected the step of a session without the refusal");
     talk.close().await?;
     Ok(Tested::Kept)
 }
 
-/// The reply to the first step of an undisturbed episode.
-async fn clean_step(subject: &Subject<'_>, index: u64) -> Result<Vec<u8>> {
+/// The first step of an undisturbed episode.
+async fn clean_step(subject: &Subject<'_>, index: u64) -> Result<Transition> {
     let mut talk = subject.episode(index).await?;
-    talk.hold_still().await?;
-    let reply = talk.reply.clone();
+    let transition = talk.hold_still().await?;
     talk.close().await?;
-    Ok(reply)
+    Ok(transition)
 }
 
 async fn silent(talk: &mut Talk) -> Result<()> {

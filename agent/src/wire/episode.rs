@@ -1,5 +1,7 @@
 //! A running episode: only what a reset returned can step.
 
+use std::time::Duration;
+
 use protocol::{Observation, Reply, Request, Transition};
 
 use super::environment::unexpected;
@@ -17,6 +19,7 @@ pub struct Episode {
     observation: Observation,
     state: [f32; STATE_LENGTH],
     expert_action: Option<[f32; ACTION_LENGTH]>,
+    simulator_time: Duration,
 }
 
 impl Episode {
@@ -26,7 +29,7 @@ impl Episode {
     ) -> Result<Self, EnvironmentFault> {
         environment.check_image(&observation.image)?;
         let (state, expert_action) = numbers(&observation)?;
-        Ok(Self { environment, observation, state, expert_action })
+        Ok(Self { environment, observation, state, expert_action, simulator_time: Duration::ZERO })
     }
 
     /// What the policy sees now.
@@ -56,12 +59,18 @@ impl Episode {
     ) -> Result<Transition, EnvironmentFault> {
         let request = |sequence| Request::Step { sequence, action: action.to_vec() };
         match self.environment.ask("Step", request).await? {
-            Reply::Stepped { transition, .. } => {
+            Reply::Stepped { transition, simulator_us, .. } => {
+                self.simulator_time = Duration::from_micros(simulator_us.into());
                 self.observe(transition.observation.clone())?;
                 Ok(transition)
             }
             other => Err(unexpected("Stepped", &other)),
         }
+    }
+
+    /// What the last step took in the simulator, as its server says: the rest of the wait for it was the wire.
+    pub fn simulator_time(&self) -> Duration {
+        self.simulator_time
     }
 
     /// Has the last reply sent once more; the world does not move. It costs what the wire costs, without a simulator.

@@ -2,7 +2,7 @@
 
 import re
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 

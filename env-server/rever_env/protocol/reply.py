@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from rever_env.protocol import value
 from rever_env.protocol.observation import Observation
 from rever_env.protocol.statistics import Statistics
-from rever_env.protocol.value import Numbered
+from rever_env.protocol.value import U32, Numbered
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,11 @@ class Observed(Numbered):
 
 @dataclass(frozen=True)
 class Stepped(Numbered):
-    """To Step."""
+    """To Step. simulator_us: microseconds of physics, picture and judge, without the wire."""
 
     sequence: int
     transition: Transition
+    simulator_us: U32
 
     def validate(self) -> None:
         super().validate()

@@ -1,6 +1,7 @@
 //! One leased session: its numbered requests, its world, its saved states.
 
 use std::collections::BTreeMap;
+use std::time::Instant;
 
 use bytes::Bytes;
 use protocol::{CodecError, FaultKind, Observation, Open, Reply, Request, encode, limits};
@@ -118,10 +119,12 @@ impl Session {
         };
         match request {
             Request::Step { sequence, action } => {
+                let begun = Instant::now();
                 let mut transition = world.step(&action)?;
+                let simulator_us = begun.elapsed().as_micros().try_into().unwrap_or(u32::MAX);
                 self.steps += 1;
                 transition.observation = self.seen(transition.observation)?;
-                Ok(Reply::Stepped { sequence, transition })
+                Ok(Reply::Stepped { sequence, transition, simulator_us })
             }
             Request::Save { sequence, slot } => {
                 self.slots.insert(slot, world.save()?);

@@ -54,6 +54,8 @@ pub enum Reply {
         sequence: u64,
         /// The step's result.
         transition: Transition,
+        /// Microseconds that the simulator took for it: physics, picture and judge, without the wire.
+        simulator_us: u32,
     },
     /// To `Save`.
     Saved {
