@@ -82,43 +82,40 @@ async fn stranger_to(server: &Server) -> zenoh::Session {
     zenoh::open(configuration).await.expect("the stranger connects")
 }
 
-/// Two episodes with everything that an agent can ask, as bytes.
-async fn trajectory(network: &Network, server: &str) -> Result<Vec<Vec<u8>>, EnvironmentFault> {
-    let mut bytes = Vec::new();
+/// Two episodes with everything that an agent can ask, as replies.
+async fn trajectory(network: &Network, server: &str) -> Result<Vec<Reply>, EnvironmentFault> {
+    let mut replies = Vec::new();
     let environment = Environment::open(network, server, open()).await?;
     let mut episode = environment.reset(spoon()).await?;
-    let observed = |observation: &protocol::Observation| {
-        encode(&Reply::Observed { sequence: 1, observation: observation.clone() })
-            .expect("a valid observation")
+    let observed = |observation: &protocol::Observation| Reply::Observed {
+        sequence: 1,
+        observation: observation.clone(),
     };
     // How long a step took is not a part of what happened.
-    let stepped = |transition| {
-        encode(&Reply::Stepped { sequence: 1, transition, simulator_us: 0 })
-            .expect("a valid transition")
-    };
-    bytes.push(observed(episode.observation()));
+    let stepped = |transition| Reply::Stepped { sequence: 1, transition, simulator_us: 0 };
+    replies.push(observed(episode.observation()));
     for step in 0..12 {
         if step == 6 {
             episode.save(2).await?;
         }
         let action = episode.expert_action().expect("the expert was asked for");
         let transition = episode.step(action).await?;
-        bytes.push(stepped(transition));
+        replies.push(stepped(transition));
     }
     episode.restore(2).await?;
-    bytes.push(observed(episode.observation()));
+    replies.push(observed(episode.observation()));
     for _ in 0..3 {
         let transition = episode.step([0.01, 0.0, -0.005, 0.0, 0.0, 0.1, 1.0]).await?;
-        bytes.push(stepped(transition));
+        replies.push(stepped(transition));
     }
     let episode = episode.finish().reset(reset("widowx_stack_cube", None)).await?;
-    bytes.push(observed(episode.observation()));
+    replies.push(observed(episode.observation()));
     episode.finish().close().await?;
-    Ok(bytes)
+    Ok(replies)
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bad_wire_ends_in_the_same_bytes_as_a_good_one() {
+async fn a_bad_wire_ends_in_the_same_replies_as_a_good_one() {
     let (network, server) = network_with_server("good", &[]).await;
     let clean = trajectory(&network, &server.id).await.expect("a good wire");
     drop(server);
