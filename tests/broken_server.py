@@ -19,7 +19,7 @@ def wrap(kind: Any, name: str) -> Callable[[Callable[..., Any]], None]:
     original = getattr(kind, name)
 
     def put(function: Callable[..., Any]) -> None:
-        setattr(kind, name, lambda *arguments: function(original, *arguments))
+        setattr(kind, name, lambda *given, **named: function(original, *given, **named))
 
     return put
 
@@ -102,8 +102,8 @@ def any_version() -> None:
 
 def steps_unreset() -> None:
     @wrap(Session, "__init__")
-    def init(original: Any, self: Any, opened: protocol.Open, worlds: Any) -> None:
-        original(self, opened, worlds)
+    def init(original: Any, self: Any, *given: Any, **named: Any) -> None:
+        original(self, *given, **named)
         self._world.reset(configuration=None, seed=0)
         self._running = True
 
@@ -123,17 +123,37 @@ def forgets_close() -> None:
 
 def other_size() -> None:
     @wrap(Session, "__init__")
-    def init(original: Any, self: Any, opened: protocol.Open, worlds: Any) -> None:
-        original(self, replace(opened, image_height=opened.image_width), worlds)
+    def init(
+        original: Any, self: Any, opened: protocol.Open, *given: Any, **named: Any
+    ) -> None:
+        original(
+            self, replace(opened, image_height=opened.image_width), *given, **named
+        )
 
 
 def overstates_time() -> None:
-    @wrap(Session, "_reply")
-    def reply(original: Any, self: Any, request: protocol.Request) -> Any:
-        answer = original(self, request)
-        if isinstance(answer, protocol.Stepped):
-            return replace(answer, simulator_us=answer.simulator_us * 1000)
-        return answer
+    @wrap(Session, "_stepped")
+    def stepped(original: Any, self: Any, *arguments: Any) -> Any:
+        answer: Any = protocol.REPLY.decode(original(self, *arguments))
+        return protocol.REPLY.encode(
+            replace(answer, simulator_us=answer.simulator_us * 1000)
+        )
+
+
+def forgets_tile() -> None:
+    @wrap(Session, "_stepped")
+    def stepped(original: Any, self: Any, *arguments: Any) -> Any:
+        answer: Any = protocol.REPLY.decode(original(self, *arguments))
+        if answer.changed_tiles:
+            observation = answer.transition.observation
+            pixels = observation.image.pixels[: -3 * protocol.limits.TILE_SIDE**2]
+            observation = replace(
+                observation, image=replace(observation.image, pixels=pixels)
+            )
+            transition = replace(answer.transition, observation=observation)
+            tiles = answer.changed_tiles[:-1]
+            answer = replace(answer, transition=transition, changed_tiles=tiles)
+        return protocol.REPLY.encode(answer)
 
 
 def any_length() -> None:
@@ -159,6 +179,7 @@ DEFECTS = {
         no_limit,
         forgets_close,
         other_size,
+        forgets_tile,
         overstates_time,
         any_length,
     )

@@ -35,7 +35,10 @@ const BROKEN: [(&str, &[&str]); 7] = [
         ],
     ),
     ("jumps_gaps,forgets_command,steps_unreset", &["gap", "save", "reset_first"]),
-    ("one_seed,no_limit,overstates_time", &["seeds", "sessions_max", "simulator_time"]),
+    (
+        "one_seed,no_limit,overstates_time,forgets_tile",
+        &["seeds", "sessions_max", "simulator_time", "save"],
+    ),
     ("forgets_close,any_length", &["sessions_max", "dimensions"]),
     ("keeps_leases", &["holder_gone", "holder_missing", "idle"]),
 ];

@@ -9,7 +9,8 @@ use agent::wire::{
     Timing, VerifierPublisher, VerifierSubscriber,
 };
 use protocol::{
-    EpisodeOutcome, Open, Opening, PROTOCOL_VERSION, Reply, Reset, Statistics, decode, encode,
+    EpisodeOutcome, Observation, Open, Opening, PROTOCOL_VERSION, Reply, Reset, Statistics,
+    Transition, decode,
 };
 
 use crate::harness::repository;
@@ -82,40 +83,34 @@ async fn stranger_to(server: &Server) -> zenoh::Session {
     zenoh::open(configuration).await.expect("the stranger connects")
 }
 
-/// Two episodes with everything that an agent can ask, as replies.
-async fn trajectory(network: &Network, server: &str) -> Result<Vec<Reply>, EnvironmentFault> {
-    let mut replies = Vec::new();
+/// What two episodes with everything that an agent can ask bring: at resets and restores, and at steps.
+type Trajectory = (Vec<Observation>, Vec<Transition>);
+
+async fn trajectory(network: &Network, server: &str) -> Result<Trajectory, EnvironmentFault> {
+    let (mut observations, mut transitions) = (Vec::new(), Vec::new());
     let environment = Environment::open(network, server, open()).await?;
     let mut episode = environment.reset(spoon()).await?;
-    let observed = |observation: &protocol::Observation| Reply::Observed {
-        sequence: 1,
-        observation: observation.clone(),
-    };
-    // How long a step took is not a part of what happened.
-    let stepped = |transition| Reply::Stepped { sequence: 1, transition, simulator_us: 0 };
-    replies.push(observed(episode.observation()));
+    observations.push(episode.observation().clone());
     for step in 0..12 {
         if step == 6 {
             episode.save(2).await?;
         }
         let action = episode.expert_action().expect("the expert was asked for");
-        let transition = episode.step(action).await?;
-        replies.push(stepped(transition));
+        transitions.push(episode.step(action).await?);
     }
     episode.restore(2).await?;
-    replies.push(observed(episode.observation()));
+    observations.push(episode.observation().clone());
     for _ in 0..3 {
-        let transition = episode.step([0.01, 0.0, -0.005, 0.0, 0.0, 0.1, 1.0]).await?;
-        replies.push(stepped(transition));
+        transitions.push(episode.step([0.01, 0.0, -0.005, 0.0, 0.0, 0.1, 1.0]).await?);
     }
     let episode = episode.finish().reset(reset("widowx_stack_cube", None)).await?;
-    replies.push(observed(episode.observation()));
+    observations.push(episode.observation().clone());
     episode.finish().close().await?;
-    Ok(replies)
+    Ok((observations, transitions))
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bad_wire_ends_in_the_same_replies_as_a_good_one() {
+async fn a_bad_wire_ends_in_the_same_steps_as_a_good_one() {
     let (network, server) = network_with_server("good", &[]).await;
     let clean = trajectory(&network, &server.id).await.expect("a good wire");
     drop(server);
@@ -131,9 +126,10 @@ async fn a_bad_wire_ends_in_the_same_replies_as_a_good_one() {
     let network = connect_through(&endpoint, timing).await;
     for _ in 0..3 {
         let lossy = trajectory(&network, &server.id).await.expect("a bad wire loses nothing");
-        assert_eq!(lossy.len(), clean.len());
-        for (index, (lossy, clean)) in lossy.iter().zip(&clean).enumerate() {
-            assert!(lossy == clean, "message {index} differs");
+        assert!(lossy.0 == clean.0, "a reset or a restore differs");
+        assert_eq!(lossy.1.len(), clean.1.len());
+        for (index, (lossy, clean)) in lossy.1.iter().zip(&clean.1).enumerate() {
+            assert!(lossy == clean, "step {index} differs");
         }
     }
     let deeds = relay.deeds();
@@ -147,7 +143,7 @@ async fn a_bad_wire_ends_in_the_same_replies_as_a_good_one() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_killed_server_is_a_fault_within_seconds_and_another_one_gives_the_same_bytes() {
+async fn a_killed_server_is_a_fault_within_seconds_and_another_one_gives_the_same_steps() {
     let (network, mut first) = network_with_server("killed", &[]).await;
     let second = Server::start(&network.listening()[0], "killed", &[]);
     let whole = trajectory(&network, &first.id).await.expect("the first server lives");
@@ -172,7 +168,7 @@ async fn a_killed_server_is_a_fault_within_seconds_and_another_one_gives_the_sam
         network.servers(1, WAIT).await.into_iter().map(|server| server.server).collect();
     assert_eq!(left, std::slice::from_ref(&second.id));
     let again = trajectory(&network, &second.id).await.expect("the second server lives");
-    assert!(again == whole, "another server gave other bytes");
+    assert!(again == whole, "another server gave other steps");
 }
 
 #[tokio::test(flavor = "multi_thread")]

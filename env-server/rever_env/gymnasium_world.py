@@ -245,7 +245,7 @@ class GymnasiumWorld:
         else:
             image = self._rendered()
         if image.shape[:2] == self._size:
-            return np.ascontiguousarray(image)
+            return np.array(image, order="C")  # an environment may draw into the same array again
         from PIL import Image
 
         # The mean of what each new pixel covers: a small picture must not lose thin things.

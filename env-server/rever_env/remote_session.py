@@ -1,6 +1,7 @@
 """The agent's end of the protocol in Python: one leased session, and what can go wrong."""
 
 import contextlib
+import dataclasses
 import os
 import queue
 import time
@@ -11,6 +12,7 @@ from typing import Any
 import zenoh
 
 from rever_env import protocol
+from rever_env.protocol import tiles
 from rever_env.serving import Endpoints
 
 _LOOK_SECS = 0.2  # between looks at who is there
@@ -56,6 +58,7 @@ class RemoteSession:
         self._replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._sequence = 0
         self._request = b""
+        self._last_image = protocol.Image(0, 0, b"")  # what a step's tiles are laid on
         self._asked_at = 0.0
         self._end = ""  # why the server ended the session
         self._declared: list[Any] = []
@@ -97,7 +100,7 @@ class RemoteSession:
             raise RemoteRefused(reply.reason)
         if isinstance(reply, protocol.Faulted):
             raise RemoteFault(f"server {self.server}: {reply.kind.value}: {reply.reason}")
-        return reply
+        return self._whole(reply)
 
     def close(self) -> None:
         """Ends the session; a server that is gone has ended it already."""
@@ -107,6 +110,21 @@ class RemoteSession:
         for declared in reversed(self._declared):
             declared.undeclare()
         self._network.close()  # type: ignore[no-untyped-call]
+
+    def _whole(self, reply: protocol.Reply) -> protocol.Reply:
+        """The reply with its whole image, which a step may bring in parts."""
+        if isinstance(reply, protocol.Stepped):
+            transition = reply.transition
+            if reply.changed_tiles is not None:
+                observation = transition.observation
+                image = tiles.complete(observation.image, reply.changed_tiles, self._last_image)
+                observation = dataclasses.replace(observation, image=image)
+                transition = dataclasses.replace(transition, observation=observation)
+                reply = dataclasses.replace(reply, transition=transition, changed_tiles=None)
+            self._last_image = transition.observation.image
+        elif isinstance(reply, protocol.Observed | protocol.Restored):
+            self._last_image = reply.observation.image
+        return reply
 
     def _open(self, ask: Callable[[protocol.Description], protocol.Open]) -> None:
         description = self._find()

@@ -39,11 +39,16 @@ _TICK, _WORK = "tick", "work"  # messages of our own to the inbox
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """fleet: who meets whom; idle_secs_max: a session without requests ends after that."""
+    """fleet: who meets whom; idle_secs_max: a session without requests ends after that.
+
+    whole_images: a step's image is not compared with the last one to send what changed only. Where
+    nothing leaves the machine comparing takes longer than it spares.
+    """
 
     fleet: str = "local"
     sessions_max: int = 16
     idle_secs_max: int = 600
+    whole_images: bool = False
 
 
 @dataclass
@@ -228,7 +233,7 @@ class Server:
 
     def _lease(self, opened: protocol.Open) -> str:
         """A new session; everything that hears its requests stands when this returns."""
-        session = Session(opened, self._worlds)
+        session = Session(opened, self._worlds, whole_images=self._options.whole_images)
         name = self._named(secrets.token_hex(8))
         publisher = self._network.declare_publisher(
             self._keys.reply(name),

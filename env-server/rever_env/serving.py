@@ -119,6 +119,12 @@ class Endpoints:
     # How long a client waits for the router or agent that it is told to connect to.
     wait_secs: float = 30.0
 
+    @property
+    def are_local(self) -> bool:
+        """Whether all ways lead through the file system, to this machine alone."""
+        ways = (*self.connect, *self.listen)
+        return not self.multicast and all(way.startswith("unixsock-stream/") for way in ways)
+
     def configuration(self) -> str:
         """zenoh's configuration in JSON."""
         link = {"rx": {"max_message_size": limits.MESSAGE_BYTES_MAX + 65_536}}
@@ -165,7 +171,12 @@ def serve(arguments: argparse.Namespace) -> int:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    options = ServerOptions(arguments.fleet, arguments.sessions, arguments.idle_secs)
+    options = ServerOptions(
+        arguments.fleet,
+        arguments.sessions,
+        arguments.idle_secs,
+        whole_images=endpoints.are_local,
+    )
     failures: list[BaseException] = []
     worlds = _worlds(arguments, options.sessions_max)
     try:

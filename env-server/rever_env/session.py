@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from rever_env import protocol, world
+from rever_env.protocol import tiles
 from rever_env.worlds import AnyWorld, Key, UnknownTask, Worlds
 
 _log = logging.getLogger(__name__)
@@ -21,13 +22,17 @@ class _Wrong(Exception):
 class Session:
     """Answers requests exactly once each. Use it in the thread that renders."""
 
-    def __init__(self, opened: protocol.Open, worlds: Worlds) -> None:
+    def __init__(
+        self, opened: protocol.Open, worlds: Worlds, *, whole_images: bool = False
+    ) -> None:
         self.steps = 0
         self.closed = False
         self._opened = opened
+        self._whole_images = whole_images
         self._worlds = worlds
         self._last_sequence = 0
         self._last_reply = b""
+        self._last_image = np.empty((0, 0, 3), np.uint8)  # of the last observation
         self._running = False
         self._slots: dict[int, Any] = {}
         worlds.task(opened.task, opened.variant)
@@ -69,7 +74,8 @@ class Session:
     def _perform(self, request: protocol.Request) -> bytes:
         sequence = request.sequence
         try:
-            return protocol.REPLY.encode(self._reply(request))
+            reply = self._reply(request)
+            return reply if isinstance(reply, bytes) else protocol.REPLY.encode(reply)
         except (_Wrong, UnknownTask, world.InvalidAction, world.InvalidPlacement) as error:
             return refused(sequence, str(error))
         except world.PhysicsDiverged as error:
@@ -83,11 +89,14 @@ class Session:
                 sequence, protocol.FaultKind.INTERNAL, f"{type(error).__name__}: {error}"
             )
 
-    def _reply(self, request: protocol.Request) -> protocol.Reply:
+    def _reply(self, request: protocol.Request) -> protocol.Reply | bytes:
+        """The reply, of a step its bytes."""
         if self.closed:
             raise _Wrong(f"expected nothing after Close, got {type(request).__name__}")
         if isinstance(request, protocol.Reset):
-            return protocol.Observed(request.sequence, self._observation(self._reset(request)))
+            observation = self._reset(request)
+            self._last_image = observation.image
+            return protocol.Observed(request.sequence, self._observation(observation))
         if isinstance(request, protocol.Close):
             self.end()
             return protocol.Closed(request.sequence)
@@ -99,14 +108,16 @@ class Session:
             transition = self._world.step(action)
             simulator_us = min(int((time.perf_counter() - begun) * 1e6), _SIMULATOR_US_MAX)
             self.steps += 1
-            return protocol.Stepped(request.sequence, self._transition(transition), simulator_us)
+            return self._stepped(request.sequence, transition, simulator_us)
         if isinstance(request, protocol.Save):
             self._slots[request.slot] = self._world.save()
             return protocol.Saved(request.sequence)
         snapshot = self._slots.get(request.slot)
         if snapshot is None:
             raise _Wrong(f"slot: expected one of {sorted(self._slots)}, got {request.slot}")
-        return protocol.Restored(request.sequence, self._observation(self._world.restore(snapshot)))
+        observation = self._world.restore(snapshot)
+        self._last_image = observation.image
+        return protocol.Restored(request.sequence, self._observation(observation))
 
     def _reset(self, request: protocol.Reset) -> world.Observation:
         self._worlds.task(request.task, request.variant)
@@ -136,23 +147,40 @@ class Session:
     def _key_of(self, task: str, variant: str) -> Key:
         return task, variant, self._opened.image_height, self._opened.image_width
 
-    def _transition(self, transition: world.Transition) -> protocol.Transition:
-        return protocol.Transition(
-            observation=self._observation(transition.observation),
-            statistics=transition.statistics,
-            reward=transition.reward,
-            terminated=transition.terminated,
-            truncated=transition.truncated,
+    def _stepped(self, sequence: int, transition: world.Transition, simulator_us: int) -> bytes:
+        image = transition.observation.image
+        changes = None if self._whole_images else tiles.changes(self._last_image, image)
+        self._last_image = image
+        changed_tiles, pixels = changes or (None, image.tobytes())
+        observation = self._observation(transition.observation, pixels)
+        judged = (
+            transition.statistics,
+            transition.reward,
+            transition.terminated,
+            transition.truncated,
         )
+        data = protocol.stepped_in_layout(
+            sequence, observation, judged, changed_tiles, simulator_us
+        )
+        if data is None:
+            stepped = protocol.Transition(observation, *judged)
+            message = protocol.Stepped(sequence, stepped, changed_tiles, simulator_us)
+            data = protocol.REPLY.encode(message)
+        return data
 
-    def _observation(self, observation: world.Observation) -> protocol.Observation:
+    def _observation(
+        self, observation: world.Observation, pixels: bytes | None = None
+    ) -> protocol.Observation:
+        """pixels: in place of the whole image's."""
         image = observation.image
         expert_action = None
         if self._opened.expert and self._world is not None:
             action = self._world.expert_action().astype(np.float32)
             expert_action = tuple(action.tolist())
         return protocol.Observation(
-            image=protocol.Image(image.shape[0], image.shape[1], image.tobytes()),
+            image=protocol.Image(
+                image.shape[0], image.shape[1], image.tobytes() if pixels is None else pixels
+            ),
             state=tuple(observation.state.tolist()),
             instruction=observation.instruction,
             expert_action=expert_action,

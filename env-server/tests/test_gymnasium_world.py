@@ -48,6 +48,24 @@ class Fickle(gymnasium.Env[NDArray[np.float32], Any]):
         return seen, 1.0, False, False, {}
 
 
+class Redrawn(gymnasium.Env[NDArray[np.uint8], Any]):
+    """Draws each step into the same array."""
+
+    observation_space = spaces.Box(0, 255, (16, 32, 3), np.uint8)
+    action_space: spaces.Space[Any] = spaces.Discrete(2)
+
+    def __init__(self) -> None:
+        self.picture = np.zeros((16, 32, 3), np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.picture[:] = 0
+        return self.picture, {}
+
+    def step(self, action: int) -> Any:
+        self.picture[:] += 1
+        return self.picture, 1.0, False, False, {}
+
+
 class Wide(Fickle):
     """Has more numbers than fit into a Step."""
 
@@ -215,6 +233,17 @@ def test_a_task_that_the_protocol_has_no_room_for_is_not_served() -> None:
             Server(network, worlds, ServerOptions())
     finally:
         del gymnasium.registry["rever-tests/Wide-v0"]
+
+
+def test_what_was_seen_stays_as_it_was() -> None:
+    gymnasium.register("rever-tests/Redrawn-v0", entry_point=lambda **_: Redrawn())
+    try:
+        world = make("rever-tests/Redrawn-v0", 16, 32)
+        seen = [world.reset(configuration=None, seed=0).image]
+        seen += [world.step(np.array([0.0])).observation.image for _ in range(2)]
+        assert [image.mean() for image in seen] == [0.0, 1.0, 2.0]
+    finally:
+        del gymnasium.registry["rever-tests/Redrawn-v0"]
 
 
 def test_an_environment_that_breaks_or_does_not_repeat_itself_is_a_fault() -> None:

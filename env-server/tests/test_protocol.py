@@ -45,6 +45,9 @@ STATISTICS = protocol.Statistics(False, False, True, False, True, False, False, 
 TRANSITION = protocol.Transition(
     dataclasses.replace(OBSERVATION, expert_action=ACTION), STATISTICS, 0.0, False, True
 )
+OBSERVATION_OF_TILES = dataclasses.replace(
+    OBSERVATION, image=protocol.Image(16, 48, bytes(index % 251 for index in range(768)))
+)
 EXAMPLES: dict[str, Any] = {
     "description": protocol.Description(
         protocol=protocol.PROTOCOL_VERSION,
@@ -83,13 +86,19 @@ EXAMPLES: dict[str, Any] = {
     "request_restore": protocol.Restore(70_000, 15),
     "request_close": protocol.Close(5_000_000_000),
     "reply_observed": protocol.Observed(1, OBSERVATION),
-    "reply_stepped": protocol.Stepped(2, TRANSITION, 4250),
+    "reply_stepped": protocol.Stepped(2, TRANSITION, None, 4250),
     "reply_saved": protocol.Saved(3),
     "reply_restored": protocol.Restored(4, OBSERVATION),
     "reply_closed": protocol.Closed(5),
     "reply_refused": protocol.Refused(6, "slot 3 holds no state"),
     "reply_faulted": protocol.Faulted(
         7, protocol.FaultKind.PHYSICS_DIVERGED, "expected finite speeds up to 100, got 250"
+    ),
+    "reply_stepped_tiles": protocol.Stepped(
+        8,
+        dataclasses.replace(TRANSITION, observation=OBSERVATION_OF_TILES),
+        (1,),
+        70_000,
     ),
     "outcome": protocol.EpisodeOutcome(
         run="evaluation-7",
@@ -117,6 +126,82 @@ EXAMPLES: dict[str, Any] = {
 def codec_of(name: str) -> protocol.Codec[Any]:
     """The codec for an example's name, which begins with its message's."""
     return CODECS[name] if name in CODECS else CODECS[name.split("_")[0]]
+
+
+def reply_of(message: protocol.Stepped) -> bytes | None:
+    """By the short way."""
+    transition = message.transition
+    judged = (
+        transition.statistics,
+        transition.reward,
+        transition.terminated,
+        transition.truncated,
+    )
+    return protocol.stepped_in_layout(
+        message.sequence,
+        transition.observation,
+        judged,
+        message.changed_tiles,
+        message.simulator_us,
+    )
+
+
+@pytest.mark.parametrize("side", [0, 1, 9, 10, 147, 148, 224])
+@pytest.mark.parametrize(
+    "sequence", [1, 127, 128, 255, 256, 65_535, 65_536, 1 << 32, (1 << 53) - 1]
+)
+def test_a_step_is_written_the_short_way_as_the_long_way(side: int, sequence: int) -> None:
+    # Sides at which the header of the image's bytes gets longer; a text that looks like one.
+    image = protocol.Image(side, side, bytes(index % 256 for index in range(3 * side * side)))
+    for expert_action in (None, ACTION):
+        observation = protocol.Observation(
+            image, tuple([0.5] * (side % 40)), "\xa6pixels\xc4\x00 é", expert_action
+        )
+        transition = dataclasses.replace(TRANSITION, observation=observation, reward=1.0)
+        message = protocol.Stepped(sequence, transition, None, sequence % (1 << 32))
+        assert reply_of(message) == protocol.REPLY.encode(message)
+    for name in ("reply_stepped", "reply_stepped_tiles"):
+        assert reply_of(EXAMPLES[name]) == protocol.REPLY.encode(EXAMPLES[name])
+
+
+def _seeing(**fields: Any) -> protocol.Stepped:
+    observation = dataclasses.replace(OBSERVATION, **fields)
+    transition = dataclasses.replace(TRANSITION, observation=observation)
+    return protocol.Stepped(2, transition, None, 0)
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (_seeing(state=(0.0, float("nan"))), "state: expected finite numbers, got nan at index 1"),
+        (_seeing(state=(float("inf"), -float("inf"))), "state: expected finite numbers, got inf"),
+        (_seeing(expert_action=(float("inf"),)), "expert_action: expected finite numbers"),
+        (_seeing(expert_action=()), "expert_action: expected 1 to 128 numbers, got 0"),
+        (_seeing(state=(0.0,) * 4097), "state: expected 0 to 4096 numbers, got 4097"),
+        (_seeing(instruction="x" * 1025), "instruction: expected at most 1024 bytes, got 1025"),
+        (
+            _seeing(image=protocol.Image(1025, 1, bytes(3075))),
+            "image height: expected 1 to 1024, got 1025",
+        ),
+        (
+            _seeing(image=protocol.Image(1, 1025, bytes(3075))),
+            "image width: expected 1 to 1024, got 1025",
+        ),
+        (
+            dataclasses.replace(
+                EXAMPLES["reply_stepped"],
+                transition=dataclasses.replace(TRANSITION, reward=float("nan")),
+            ),
+            "reward: expected finite numbers, got nan",
+        ),
+    ],
+)
+def test_the_short_way_leaves_what_is_wrong_to_the_long_way(
+    message: protocol.Stepped, words: str
+) -> None:
+    assert reply_of(message) is None
+    with pytest.raises(protocol.CodecError, match=words):
+        protocol.REPLY.encode(message)
 
 
 def test_there_is_an_example_for_each_golden_file() -> None:

@@ -16,6 +16,7 @@ import zenoh
 from conftest import free_endpoint
 
 from rever_env import protocol, tasks, world
+from rever_env.protocol import tiles
 from rever_env.server import Server, ServerOptions
 from rever_env.serving import Endpoints
 from rever_env.session import Session
@@ -121,6 +122,22 @@ def test_slots_last_until_the_next_reset(session: Session) -> None:
     assert stepped.transition == again.transition
     assert isinstance(ask(session, protocol.Reset(8, SPOON, "default", 3, 7)), protocol.Observed)
     check_refused(ask(session, protocol.Restore(9, 1)), 9, "slot: expected one of [], got 1")
+
+
+def test_a_step_brings_the_tiles_that_changed_or_all_of_them(worlds: Worlds) -> None:
+    brought = []
+    for whole_images in (False, True):
+        session = Session(OPEN, worlds, whole_images=whole_images)
+        observed = ask(session, protocol.Reset(1, SPOON, "default", 3, 7))
+        stepped = ask(session, protocol.Step(2, (0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
+        session.end()
+        assert isinstance(observed, protocol.Observed) and isinstance(stepped, protocol.Stepped)
+        brought.append((observed.observation.image, stepped))
+    (first, parts), (_, whole) = brought
+    assert whole.changed_tiles is None
+    assert parts.changed_tiles is not None and 0 < len(parts.changed_tiles) <= 8  # of 16
+    image = parts.transition.observation.image
+    assert tiles.complete(image, parts.changed_tiles, first) == whole.transition.observation.image
 
 
 def test_a_world_that_served_others_gives_the_same_bytes(session: Session, worlds: Worlds) -> None:
@@ -307,3 +324,12 @@ def test_only_one_way_out_and_no_way_in_makes_a_client() -> None:
     assert mode((first,), ()) == "client"
     assert mode((first, second), ()) == "peer"
     assert mode((first,), (second,)) == "peer"
+
+
+def test_the_file_system_alone_is_local() -> None:
+    socket, loopback = "unixsock-stream//tmp/a", "tcp/127.0.0.1:1"
+    assert Endpoints((socket,), (), multicast=False).are_local
+    assert Endpoints((), (socket,), multicast=False).are_local
+    assert not Endpoints((socket,), (loopback,), multicast=False).are_local
+    assert not Endpoints((loopback,), (), multicast=False).are_local
+    assert not Endpoints((socket,), (), multicast=True).are_local

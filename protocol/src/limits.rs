@@ -26,6 +26,8 @@ pub const NAME_BYTES_MAX: usize = 128;
 pub const TEXT_BYTES_MAX: usize = 1024;
 /// Height and width of an image in pixels.
 pub const IMAGE_SIDE_MAX: usize = 1024;
+/// Height and width of the tiles in which a step's image may come, in pixels.
+pub const TILE_SIDE: usize = 16;
 /// Maps and arrays inside one another.
 pub const DEPTH_MAX: usize = 8;
 /// Elements of an array or a map.

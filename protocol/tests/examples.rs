@@ -112,7 +112,20 @@ pub fn requests() -> [(&'static str, Request); 6] {
     ]
 }
 
-pub fn replies() -> [(&'static str, Reply); 7] {
+/// A step of whose three tiles the middle one has changed.
+fn tiles() -> Reply {
+    let pixels = (0..768).map(|index| (index % 251) as u8).collect();
+    let image = Image { height: 16, width: 48, pixels };
+    let observation = Observation { image, ..observation() };
+    Reply::Stepped {
+        sequence: 8,
+        transition: Transition { observation, ..transition() },
+        changed_tiles: Some(vec![1]),
+        simulator_us: 70_000,
+    }
+}
+
+pub fn replies() -> [(&'static str, Reply); 8] {
     let reason = "slot 3 holds no state".into();
     let diverged = "expected finite speeds up to 100, got 250".into();
     let kind = FaultKind::PhysicsDiverged;
@@ -120,13 +133,19 @@ pub fn replies() -> [(&'static str, Reply); 7] {
         ("reply_observed", Reply::Observed { sequence: 1, observation: observation() }),
         (
             "reply_stepped",
-            Reply::Stepped { sequence: 2, transition: transition(), simulator_us: 4_250 },
+            Reply::Stepped {
+                sequence: 2,
+                transition: transition(),
+                changed_tiles: None,
+                simulator_us: 4_250,
+            },
         ),
         ("reply_saved", Reply::Saved { sequence: 3 }),
         ("reply_restored", Reply::Restored { sequence: 4, observation: observation() }),
         ("reply_closed", Reply::Closed { sequence: 5 }),
         ("reply_refused", Reply::Refused { sequence: 6, reason }),
         ("reply_faulted", Reply::Faulted { sequence: 7, kind, reason: diverged }),
+        ("reply_stepped_tiles", tiles()),
     ]
 }
 

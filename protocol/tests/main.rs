@@ -10,3 +10,5 @@ mod keys;
 mod readme;
 /// Bytes that must be refused, and the words for it.
 mod refused;
+/// Pictures as the tiles that changed.
+mod tiles;

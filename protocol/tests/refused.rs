@@ -3,22 +3,22 @@
 use protocol::{Description, Message, Open, PROTOCOL_VERSION, Reply, Request, decode, encode};
 use serde_json::{Map, Value, json};
 
-use crate::{examples, golden};
+use crate::{examples, golden, tiles};
 
 /// A message that must be refused: its name, its type, its bytes, and the words that the refusal must contain.
-struct Case {
+pub struct Case {
     name: &'static str,
     message: &'static str,
     bytes: Vec<u8>,
     words: String,
 }
 
-fn case(name: &'static str, message: &'static str, bytes: Vec<u8>, words: &str) -> Case {
+pub fn case(name: &'static str, message: &'static str, bytes: Vec<u8>, words: &str) -> Case {
     Case { name, message, bytes, words: words.to_owned() }
 }
 
 /// The bytes of an example with its first `from` replaced by `to`.
-fn changed(mut bytes: Vec<u8>, from: &[u8], to: &[u8]) -> Vec<u8> {
+pub fn changed(mut bytes: Vec<u8>, from: &[u8], to: &[u8]) -> Vec<u8> {
     let start =
         bytes.windows(from.len()).position(|window| window == from).expect("it is in there");
     bytes.splice(start..start + from.len(), to.iter().copied());
@@ -50,7 +50,14 @@ fn stepped() -> Vec<u8> {
 }
 
 fn cases() -> Vec<Case> {
-    let cases = [structure_cases(), field_cases(), length_cases(), number_cases(), peer_cases()];
+    let cases = [
+        structure_cases(),
+        field_cases(),
+        length_cases(),
+        number_cases(),
+        peer_cases(),
+        tiles::cases(),
+    ];
     cases.into_iter().flatten().collect()
 }
 

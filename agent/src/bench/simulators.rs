@@ -6,7 +6,7 @@ use anyhow::{Context, Result, ensure};
 use serde::Serialize;
 
 use super::quantile;
-use super::wire::{EPISODE_STEPS, HOLD_STILL, WARM_UP_STEPS, at_once, open, reset};
+use super::wire::{EPISODE_STEPS, WARM_UP_STEPS, at_once, circling, open, reset};
 use crate::servers::LocalServers;
 use crate::simulator::{ServerProgram, Simulator};
 use crate::site::Site;
@@ -116,7 +116,7 @@ impl SimulatorsBench<'_> {
                     own = reset(own.into_iter().map(Episode::finish).collect()).await?;
                 }
                 let (step_ms, own) = at_once(own, |mut episode: Episode| async move {
-                    episode.step(HOLD_STILL).await.map(|_| episode)
+                    episode.step(circling(index)).await.map(|_| episode)
                 })
                 .await?;
                 if index >= WARM_UP_STEPS {

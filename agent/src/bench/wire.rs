@@ -6,6 +6,7 @@
 //! Beside each step, in turns: the same reply once more, which a server sends without simulating or writing anything, and
 //! as many bytes through a bare socket, which is what this machine takes for them at that hour.
 
+use std::f32::consts::TAU;
 use std::io::{Read, Result as IoResult, Write};
 use std::os::unix::net::UnixStream;
 use std::thread;
@@ -26,15 +27,15 @@ use crate::wire::{Environment, EnvironmentFault, Episode, Network};
 pub(super) const EPISODE_STEPS: usize = 50;
 /// The first steps fill caches.
 pub(super) const WARM_UP_STEPS: usize = 5;
-/// Nothing moves, and the gripper stays open.
-pub(super) const HOLD_STILL: [f32; 7] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+/// Control steps for a round of the gripper.
+const ROUND_STEPS: f32 = 16.0;
+/// How far it goes in a step, in metres: about as far as in an episode of the expert.
+const STEP_LENGTH: f32 = 0.02;
 /// The local server is on the network already.
 pub(super) const SERVER_WAIT: Duration = Duration::from_secs(30);
 
 /// A Step as it is sent.
 const REQUEST_BYTES: usize = 62;
-/// A Stepped without its picture, about.
-const REPLY_REST_BYTES: usize = 400;
 
 /// One number of sessions on one server, all of them asking at once.
 #[derive(Debug, Clone, Serialize)]
@@ -55,6 +56,8 @@ pub struct Row {
     pub wire_ms_p95: f64,
     /// A repeated reply: the time of all sessions' repetitions over their number, median.
     pub repeat_ms_p50: f64,
+    /// A reply: median of the sessions' means.
+    pub reply_bytes_p50: f64,
     /// One request's and one reply's bytes through a socket between two threads, median.
     pub bare_ms_p50: f64,
 }
@@ -100,17 +103,16 @@ impl WireBench<'_> {
     /// Steps and repetitions of these sessions in turns.
     async fn count(&self, environments: Vec<Environment>) -> Result<(Row, Vec<Environment>)> {
         let sessions = environments.len();
-        let mut socket = BareSocket::open(3 * (self.side as usize).pow(2) + REPLY_REST_BYTES)
-            .context("cannot open a socket")?;
-        let [mut stepped, mut simulated, mut wire, mut repeated, mut bare] =
-            [const { Vec::new() }; 5];
+        let mut socket = BareSocket::open().context("cannot open a socket")?;
+        let [mut stepped, mut simulated, mut wire, mut repeated, mut sizes, mut bare] =
+            [const { Vec::new() }; 6];
         let mut episodes = reset(environments).await?;
         for index in 0..WARM_UP_STEPS + self.steps {
             if index % EPISODE_STEPS == EPISODE_STEPS - 1 {
                 episodes = reset(episodes.into_iter().map(Episode::finish).collect()).await?;
             }
             let (step_ms, after) = at_once(episodes, |mut episode: Episode| async move {
-                episode.step(HOLD_STILL).await.map(|_| episode)
+                episode.step(circling(index)).await.map(|_| episode)
             })
             .await?;
             let in_simulator = after.iter().map(Episode::simulator_time).sum::<Duration>();
@@ -119,18 +121,22 @@ impl WireBench<'_> {
                 episode.repeat().await.map(|()| episode)
             })
             .await?;
-            episodes = after;
-            let bare_ms = socket.exchange().context("the socket's other end is gone")?;
+            let reply_bytes = after.iter().map(Episode::reply_bytes).sum::<usize>() / sessions;
+            let bare_ms = socket.exchange(reply_bytes).context("the socket's other end is gone")?;
             if index >= WARM_UP_STEPS {
                 stepped.push(step_ms);
                 simulated.push(simulator_ms);
                 wire.push(step_ms - simulator_ms);
                 repeated.push(repeat_ms);
+                sizes.push(reply_bytes as f64);
                 bare.push(bare_ms);
             }
+            episodes = after;
         }
-        for times in [&mut stepped, &mut simulated, &mut wire, &mut repeated, &mut bare] {
-            times.sort_by(f64::total_cmp);
+        for figures in
+            [&mut stepped, &mut simulated, &mut wire, &mut repeated, &mut sizes, &mut bare]
+        {
+            figures.sort_by(f64::total_cmp);
         }
         let row = Row {
             simulator: self.site.simulator,
@@ -141,10 +147,19 @@ impl WireBench<'_> {
             wire_ms_p50: quantile(&wire, 0.5),
             wire_ms_p95: quantile(&wire, 0.95),
             repeat_ms_p50: quantile(&repeated, 0.5),
+            reply_bytes_p50: quantile(&sizes, 0.5),
             bare_ms_p50: quantile(&bare, 0.5),
         };
         Ok((row, episodes.into_iter().map(Episode::finish).collect()))
     }
+}
+
+/// The gripper goes in circles above the table, and opens and closes: as much of the picture changes as in an episode.
+pub(super) fn circling(step: usize) -> [f32; 7] {
+    let angle = step as f32 * TAU / ROUND_STEPS;
+    let (across, along) = angle.sin_cos();
+    let gripper = if across < 0.0 { -1.0 } else { 1.0 };
+    [STEP_LENGTH * along, STEP_LENGTH * across, 0.0, 0.0, 0.0, 0.0, gripper]
 }
 
 /// A thread that gives a reply's bytes for a request's bytes; it ends with this.
@@ -154,21 +169,28 @@ struct BareSocket {
 }
 
 impl BareSocket {
-    fn open(reply_bytes: usize) -> IoResult<Self> {
+    fn open() -> IoResult<Self> {
         let (stream, mut other) = UnixStream::pair()?;
-        let reply = vec![0; reply_bytes];
-        let sent = reply.clone();
         thread::spawn(move || {
-            let mut request = [0; REQUEST_BYTES];
-            while other.read_exact(&mut request).is_ok() && other.write_all(&sent).is_ok() {}
+            let (mut request, mut reply) = ([0; REQUEST_BYTES], Vec::new());
+            while other.read_exact(&mut request).is_ok() {
+                let [a, b, c, d, ..] = request;
+                reply.resize(u32::from_le_bytes([a, b, c, d]) as usize, 0);
+                if other.write_all(&reply).is_err() {
+                    break;
+                }
+            }
         });
-        Ok(Self { stream, reply })
+        Ok(Self { stream, reply: Vec::new() })
     }
 
-    /// Milliseconds of one exchange. Blocks.
-    fn exchange(&mut self) -> IoResult<f64> {
+    /// Milliseconds of one exchange with so large a reply. Blocks.
+    fn exchange(&mut self, reply_bytes: usize) -> IoResult<f64> {
+        self.reply.resize(reply_bytes, 0);
+        let mut request = [0; REQUEST_BYTES];
+        request[..4].copy_from_slice(&(reply_bytes as u32).to_le_bytes());
         let begun = Instant::now();
-        self.stream.write_all(&[0; REQUEST_BYTES])?;
+        self.stream.write_all(&request)?;
         self.stream.read_exact(&mut self.reply)?;
         Ok(begun.elapsed().as_secs_f64() * 1e3)
     }

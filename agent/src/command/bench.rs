@@ -173,7 +173,7 @@ fn wire(arguments: WireArguments) -> Result<()> {
         write_json(path, serde_json::json!({ "side": side, "rows": rows }))?;
     }
     println!(
-        "{:>9} {:>8} {:>7} {:>8} {:>12} {:>8} {:>8} {:>9} {:>8} {:>7}",
+        "{:>9} {:>8} {:>7} {:>8} {:>12} {:>8} {:>8} {:>9} {:>8} {:>8} {:>7}",
         "simulator",
         "sessions",
         "steps",
@@ -182,12 +182,13 @@ fn wire(arguments: WireArguments) -> Result<()> {
         "wire ms",
         "wire p95",
         "repeat ms",
+        "reply kB",
         "bare ms",
         "share"
     );
     for row in rows {
         println!(
-            "{:>9} {:>8} {:>7} {:>8.3} {:>12.3} {:>8.3} {:>8.3} {:>9.3} {:>8.3} {:>5.1} %",
+            "{:>9} {:>8} {:>7} {:>8.3} {:>12.3} {:>8.3} {:>8.3} {:>9.3} {:>8.1} {:>8.3} {:>5.1} %",
             row.simulator.to_string(),
             row.sessions,
             row.steps,
@@ -196,6 +197,7 @@ fn wire(arguments: WireArguments) -> Result<()> {
             row.wire_ms_p50,
             row.wire_ms_p95,
             row.repeat_ms_p50,
+            row.reply_bytes_p50 / 1e3,
             row.bare_ms_p50,
             100.0 * row.wire_ms_p50 / row.step_ms_p50
         );

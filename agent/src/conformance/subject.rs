@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use protocol::{
-    Description, Dimension, Observation, Open, PROTOCOL_VERSION, Reply, Request, TaskDescription,
-    Transition, decode, encode,
+    Description, Dimension, Image, Observation, Open, PROTOCOL_VERSION, Reply, Request,
+    TaskDescription, Transition, decode, encode,
 };
 
 use serde::Serialize;
@@ -21,8 +21,8 @@ pub const SILENCE: Duration = Duration::from_secs(1);
 /// How long sessions of a failed test may take to end, and how often that is looked at.
 const SETTLE_WAIT_MAX: Duration = Duration::from_secs(3);
 const SETTLE_LOOK: Duration = Duration::from_millis(50);
-/// Of the images that are asked for: small, so that the tests are quick.
-const SIDE: u32 = 32;
+/// Of the images that are asked for: small, so that the tests are quick, and of enough tiles that most stay as they are.
+const SIDE: u32 = 96;
 /// How far a dimension is moved, as a share of its range; without bounds, in its own unit.
 const SHARE: f32 = 0.02;
 
@@ -43,6 +43,8 @@ pub struct Talk {
     /// The last request as it was sent, and its reply as it came.
     pub request: Vec<u8>,
     pub reply: Vec<u8>,
+    /// Of the last observation: what a step's tiles are laid on.
+    image: Option<Image>,
 }
 
 impl<'a> Subject<'a> {
@@ -124,6 +126,7 @@ impl<'a> Subject<'a> {
             sequence: 0,
             request: Vec::new(),
             reply: Vec::new(),
+            image: None,
         })
     }
 
@@ -142,14 +145,35 @@ impl Talk {
         self.request = encode(&request(sequence))?;
         self.reply = self.answer_to(&self.request.clone()).await?;
         self.sequence = sequence;
-        let reply: Reply = decode(&self.reply)?;
+        let mut reply: Reply = decode(&self.reply)?;
         ensure!(
             reply.sequence() == sequence,
             "expected a reply number {sequence}, got {} number {}",
             reply.kind(),
             reply.sequence()
         );
+        self.look(&mut reply)?;
         Ok(reply)
+    }
+
+    /// Completes the reply's image, if it has one, and keeps it.
+    fn look(&mut self, reply: &mut Reply) -> Result<()> {
+        let image = match reply {
+            Reply::Observed { observation, .. } | Reply::Restored { observation, .. } => {
+                &observation.image
+            }
+            Reply::Stepped { transition, changed_tiles, .. } => {
+                let image = &mut transition.observation.image;
+                if let Some(tiles) = changed_tiles.take() {
+                    let last = self.image.take().context("expected a whole image first")?;
+                    image.complete(&tiles, last).map_err(anyhow::Error::msg)?;
+                }
+                image
+            }
+            _ => return Ok(()),
+        };
+        self.image = Some(image.clone());
+        Ok(())
     }
 
     /// Sends any bytes and returns what comes back.

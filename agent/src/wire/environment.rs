@@ -34,6 +34,8 @@ pub struct Environment {
     losses: u32,
     signs: watch::Receiver<Sign>,
     replies: mpsc::Receiver<ZBytes>,
+    /// Of the last reply that was awaited.
+    pub(super) reply_bytes: usize,
     publisher: Publisher<'static>,
     _subscriber: Subscriber<()>,
     _token: LivelinessToken,
@@ -86,6 +88,7 @@ impl Environment {
             losses,
             signs,
             replies,
+            reply_bytes: 0,
             publisher,
             _subscriber: subscriber,
             _token: token,
@@ -185,6 +188,7 @@ impl Environment {
                     let reply: Reply = decode_shared(&bytes).map_err(EnvironmentFault::wire)?;
                     // Number 0 is about the session itself, or about a request that could not be read.
                     if reply.sequence() == self.sequence || reply.sequence() == 0 {
+                        self.reply_bytes = bytes.len();
                         return Ok(Some(reply));
                     }
                 }

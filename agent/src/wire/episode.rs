@@ -1,5 +1,6 @@
 //! A running episode: only what a reset returned can step.
 
+use std::mem;
 use std::time::Duration;
 
 use protocol::{Observation, Reply, Request, Transition};
@@ -59,7 +60,12 @@ impl Episode {
     ) -> Result<Transition, EnvironmentFault> {
         let request = |sequence| Request::Step { sequence, action: action.to_vec() };
         match self.environment.ask("Step", request).await? {
-            Reply::Stepped { transition, simulator_us, .. } => {
+            Reply::Stepped { mut transition, changed_tiles, simulator_us, .. } => {
+                if let Some(tiles) = changed_tiles {
+                    let last = mem::take(&mut self.observation.image);
+                    let image = &mut transition.observation.image;
+                    image.complete(&tiles, last).map_err(EnvironmentFault::wire)?;
+                }
                 self.simulator_time = Duration::from_micros(simulator_us.into());
                 self.observe(transition.observation.clone())?;
                 Ok(transition)
@@ -71,6 +77,11 @@ impl Episode {
     /// What the last step took in the simulator, as its server says: the rest of the wait for it was the wire.
     pub fn simulator_time(&self) -> Duration {
         self.simulator_time
+    }
+
+    /// Size of the last reply, whose image may be the tiles that changed.
+    pub fn reply_bytes(&self) -> usize {
+        self.environment.reply_bytes
     }
 
     /// Has the last reply sent once more; the world does not move. It costs what the wire costs, without a simulator.

@@ -24,6 +24,7 @@ from rever_env.protocol.reply import (
     Saved,
     Stepped,
     Transition,
+    stepped_in_layout,
 )
 from rever_env.protocol.request import (
     Close,
@@ -82,6 +83,7 @@ __all__ = [
     "TooLarge",
     "Transition",
     "VerifierUpdate",
+    "stepped_in_layout",
 ]
 
 DESCRIPTION: Codec[Description] = Codec(

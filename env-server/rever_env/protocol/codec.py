@@ -208,7 +208,8 @@ def _field(hint: Any) -> tuple[Reader, Writer]:
     if origin is tuple and typing.get_args(hint)[0] is float:
         return _floats, _as_it_is
     if origin is tuple:
-        return _tuple(*_field(typing.get_args(hint)[0]))
+        reader, writer = _field(typing.get_args(hint)[0])
+        return _tuple(reader), writer if writer is _as_it_is else _each(writer)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return _dataclass(hint)
     if hint is int:
@@ -241,13 +242,17 @@ def _floats(value: object) -> tuple[float, ...]:
     return tuple(value)
 
 
-def _tuple(reader: Reader, writer: Writer) -> tuple[Reader, Writer]:
+def _tuple(reader: Reader) -> Reader:
     def read(value: object) -> tuple[Any, ...]:
         if type(value) is not list:
             raise ValueError(f"invalid type: {_kind(value)}, expected a sequence")
         return tuple(reader(element) for element in value)
 
-    return read, lambda value: [writer(element) for element in value]
+    return read
+
+
+def _each(writer: Writer) -> Writer:
+    return lambda value: [writer(element) for element in value]
 
 
 def _enumeration(kind: type[enum.Enum]) -> Reader:

@@ -13,6 +13,7 @@ MESSAGE_BYTES_MAX = VERIFIER_UPDATE_BYTES_MAX  # what a transport must be willin
 NAME_BYTES_MAX = 128  # task, variant, run, strategy, holder, server, session, digest
 TEXT_BYTES_MAX = 1024  # instruction, reason, simulator
 IMAGE_SIDE_MAX = 1024  # pixels
+TILE_SIDE = 16  # pixels, of the tiles in which a step's image may come
 DEPTH_MAX = 8  # maps and arrays inside one another
 ELEMENTS_MAX = 4096  # of an array or a map
 SLOTS_MAX = 16  # save slots of a session, numbered from 0

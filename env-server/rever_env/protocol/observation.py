@@ -13,6 +13,19 @@ class Image:
     width: int
     pixels: bytes
 
+    def validate(self) -> None:
+        self.validate_sides()
+        expected = self.height * self.width * 3
+        if len(self.pixels) != expected:
+            raise ValueError(
+                f"image: expected {expected} bytes for {self.height} x {self.width} pixels, "
+                f"got {len(self.pixels)}"
+            )
+
+    def validate_sides(self) -> None:
+        fields = "image height", "image width"
+        value.image_sides(fields, self.height, self.width)
+
 
 @dataclass(frozen=True)
 class Observation:
@@ -27,15 +40,11 @@ class Observation:
     expert_action: tuple[float, ...] | None
 
     def validate(self) -> None:
-        image = self.image
-        fields = "image height", "image width"
-        value.image_sides(fields, image.height, image.width)
-        expected = image.height * image.width * 3
-        if len(image.pixels) != expected:
-            raise ValueError(
-                f"image: expected {expected} bytes for {image.height} x {image.width} pixels, "
-                f"got {len(image.pixels)}"
-            )
+        self.image.validate()
+        self.validate_rest()
+
+    def validate_rest(self) -> None:
+        """All but the image."""
         value.length("state", self.state, 0, limits.STATE_DIMENSIONS_MAX)
         value.finite("state", self.state)
         value.text("instruction", self.instruction)

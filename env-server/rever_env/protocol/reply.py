@@ -1,12 +1,18 @@
 """What a server answers, echoing the request's number."""
 
 import enum
+import math
+import struct
 from dataclasses import dataclass
 
-from rever_env.protocol import value
+import msgpack
+
+from rever_env.protocol import limits, tiles, value
 from rever_env.protocol.observation import Observation
 from rever_env.protocol.statistics import Statistics
 from rever_env.protocol.value import U32, Numbered
+
+_ACTION_LENGTHS = range(1, limits.ACTION_DIMENSIONS_MAX + 1)
 
 
 @dataclass(frozen=True)
@@ -42,15 +48,24 @@ class Observed(Numbered):
 
 @dataclass(frozen=True)
 class Stepped(Numbered):
-    """To Step. simulator_us: microseconds of physics, picture and judge, without the wire."""
+    """To Step. simulator_us: microseconds of physics, picture and judge, without the wire.
+
+    changed_tiles: None, or the image's pixels are those of these tiles only (tiles.complete).
+    """
 
     sequence: int
     transition: Transition
+    changed_tiles: tuple[U32, ...] | None
     simulator_us: U32
 
     def validate(self) -> None:
         super().validate()
-        self.transition.observation.validate()
+        observation = self.transition.observation
+        if self.changed_tiles is None:
+            observation.image.validate()
+        else:
+            tiles.validate(observation.image, self.changed_tiles)
+        observation.validate_rest()
         value.finite("reward", (self.transition.reward,))
 
 
@@ -103,6 +118,64 @@ class Faulted(Numbered):
     def validate(self) -> None:
         super().validate()
         value.text("reason", self.reason)
+
+
+_PIXELS = b"\xa6pixels"
+_NO_PIXELS = _PIXELS + b"\xc4\x00"
+_BYTES_HEADERS = tuple(
+    (1 << 8 * struct.calcsize(form), mark, struct.Struct(">B" + form))
+    for mark, form in ((0xC4, "B"), (0xC5, "H"), (0xC6, "I"))
+)
+_packer = msgpack.Packer(use_single_float=True)
+
+
+def stepped_in_layout(
+    sequence: int,
+    observation: Observation,
+    judged: tuple[Statistics, float, bool, bool],
+    changed_tiles: tuple[int, ...] | None,
+    simulator_us: int,
+) -> bytes | None:
+    """What the codec writes of the same Stepped, or None where it has to say what is wrong.
+
+    judged: statistics, reward, terminated, truncated. The image's bytes and the tiles' numbers
+    belong together; tiles.changes gives them so.
+    Nearly all replies are one, and right after a control step nothing of Python's is in the
+    processor's caches: this touches little of it.
+    """
+    statistics, reward, terminated, truncated = judged
+    image, state, expert_action = observation.image, observation.state, observation.expert_action
+    total = sum(state, reward) + sum(expert_action or ())  # not finite if one of them is not
+    if (
+        not math.isfinite(total)
+        or len(state) > limits.STATE_DIMENSIONS_MAX
+        or len(observation.instruction) > limits.TEXT_BYTES_MAX // 4  # characters of up to 4 bytes
+        or (expert_action is not None and len(expert_action) not in _ACTION_LENGTHS)
+        or image.height > limits.IMAGE_SIDE_MAX
+        or image.width > limits.IMAGE_SIDE_MAX
+    ):
+        return None
+    # The image's bytes are put in afterwards: MessagePack's writer would grow around them.
+    data: bytes = _packer.pack(
+        {
+            "Stepped": {
+                "sequence": sequence,
+                "transition": {
+                    "observation": vars(observation) | {"image": vars(image) | {"pixels": b""}},
+                    "statistics": vars(statistics),
+                    "reward": reward,
+                    "terminated": terminated,
+                    "truncated": truncated,
+                },
+                "changed_tiles": changed_tiles,
+                "simulator_us": simulator_us,
+            }
+        }
+    )
+    count = len(image.pixels)
+    at = data.index(_NO_PIXELS)  # the first: nothing before it could hold so much
+    header = next(form.pack(mark, count) for end, mark, form in _BYTES_HEADERS if count < end)
+    return b"".join((data[:at], _PIXELS, header, image.pixels, data[at + len(_NO_PIXELS) :]))
 
 
 Reply = Observed | Stepped | Saved | Restored | Closed | Refused | Faulted

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use bytes::Bytes;
-use protocol::{CodecError, FaultKind, Observation, Open, Reply, Request, encode, limits};
+use protocol::{CodecError, FaultKind, Image, Observation, Open, Reply, Request, encode, limits};
 
 use crate::fault::Fault;
 use crate::world::{Snapshot, World};
@@ -19,6 +19,8 @@ pub struct Session {
     opened: Open,
     last_sequence: u64,
     last_reply: Bytes,
+    /// Of the last observation, as its holder has it.
+    last_image: Option<Image>,
     is_running: bool,
     slots: BTreeMap<u32, Snapshot>,
     world: Option<(Key, World)>,
@@ -35,6 +37,7 @@ impl Session {
             opened,
             last_sequence: 0,
             last_reply: Bytes::new(),
+            last_image: None,
             is_running: false,
             slots: BTreeMap::new(),
             world: Some((key, world)),
@@ -106,6 +109,7 @@ impl Session {
                 let observation = world.reset(configuration, seed)?;
                 self.slots.clear();
                 self.is_running = true;
+                self.last_image = Some(observation.image.clone());
                 return Ok(Reply::Observed { sequence, observation: self.seen(observation)? });
             }
             Request::Close { sequence } => {
@@ -124,7 +128,15 @@ impl Session {
                 let simulator_us = begun.elapsed().as_micros().try_into().unwrap_or(u32::MAX);
                 self.steps += 1;
                 transition.observation = self.seen(transition.observation)?;
-                Ok(Reply::Stepped { sequence, transition, simulator_us })
+                let image = &mut transition.observation.image;
+                let whole = image.clone();
+                let changes = self.last_image.as_ref().and_then(|last| whole.changes(last));
+                let changed_tiles = changes.map(|(tiles, pixels)| {
+                    image.pixels = pixels;
+                    tiles
+                });
+                self.last_image = Some(whole);
+                Ok(Reply::Stepped { sequence, transition, changed_tiles, simulator_us })
             }
             Request::Save { sequence, slot } => {
                 self.slots.insert(slot, world.save()?);
@@ -138,6 +150,7 @@ impl Session {
                     )));
                 };
                 let observation = world.restore(snapshot)?;
+                self.last_image = Some(observation.image.clone());
                 Ok(Reply::Restored { sequence, observation: self.seen(observation)? })
             }
             Request::Reset { .. } | Request::Close { .. } => unreachable!("answered above"),

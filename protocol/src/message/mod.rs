@@ -9,6 +9,7 @@ mod reply;
 mod request;
 mod single;
 mod statistics;
+mod tiles;
 mod value;
 mod verifier_update;
 

@@ -7,7 +7,7 @@ use super::{single, value};
 use crate::limits::{ACTION_DIMENSIONS_MAX, STATE_DIMENSIONS_MAX};
 
 /// A picture; 0 x 0 where none was asked for.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Image {
     /// Rows.
@@ -37,8 +37,7 @@ pub struct Observation {
 
 impl Image {
     pub(crate) fn validate(&self) -> Result<(), String> {
-        let fields = ["image height", "image width"];
-        value::image_sides(fields, self.height as u64, self.width as u64)?;
+        self.validate_sides()?;
         let bytes = self.height * self.width * 3;
         if self.pixels.len() != bytes {
             return Err(format!(
@@ -50,11 +49,21 @@ impl Image {
         }
         Ok(())
     }
+
+    pub(super) fn validate_sides(&self) -> Result<(), String> {
+        let fields = ["image height", "image width"];
+        value::image_sides(fields, self.height as u64, self.width as u64)
+    }
 }
 
 impl Observation {
     pub(crate) fn validate(&self) -> Result<(), String> {
         self.image.validate()?;
+        self.validate_rest()
+    }
+
+    /// All but the image.
+    pub(super) fn validate_rest(&self) -> Result<(), String> {
         value::length("state", self.state.len(), 0, STATE_DIMENSIONS_MAX)?;
         value::finite("state", &self.state)?;
         value::text("instruction", &self.instruction)?;

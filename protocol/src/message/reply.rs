@@ -54,6 +54,9 @@ pub enum Reply {
         sequence: u64,
         /// The step's result.
         transition: Transition,
+        /// None: the image is whole. Else its `pixels` are those of these tiles of 16 x 16 pixels only, numbered row by
+        /// row, one tile after the other; the others are as in the session's last observation ([`super::Image::complete`]).
+        changed_tiles: Option<Vec<u32>>,
         /// Microseconds that the simulator took for it: physics, picture and judge, without the wire.
         simulator_us: u32,
     },
@@ -145,8 +148,13 @@ impl Message for Reply {
             Reply::Observed { observation, .. } | Reply::Restored { observation, .. } => {
                 observation.validate()
             }
-            Reply::Stepped { transition, .. } => {
-                transition.observation.validate()?;
+            Reply::Stepped { transition, changed_tiles, .. } => {
+                let observation = &transition.observation;
+                match changed_tiles {
+                    None => observation.image.validate()?,
+                    Some(tiles) => observation.image.validate_tiles(tiles)?,
+                }
+                observation.validate_rest()?;
                 value::finite("reward", &[transition.reward])
             }
             Reply::Refused { reason, .. } | Reply::Faulted { reason, .. } => {
