@@ -1,5 +1,6 @@
 """Sessions and the serving process, with real worlds and real sockets."""
 
+import contextlib
 import json
 import os
 import signal
@@ -232,13 +233,20 @@ def test_idle_worlds_are_limited() -> None:
     assert worlds.take(key) is taken[1]
 
 
-def serve(endpoint: str, *arguments: str, launcher: tuple[str, ...] = ()) -> subprocess.Popen[str]:
-    """A serving process that has said nothing yet."""
+@contextlib.contextmanager
+def serve(
+    endpoint: str, *arguments: str, launcher: tuple[str, ...] = ()
+) -> Iterator[subprocess.Popen[str]]:
+    """A serving process that has said nothing yet; a test that fails ends it."""
     command = [sys.executable, "-m", "rever_env", "serve", "--listen", endpoint, *arguments]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
-    return subprocess.Popen(
+    with subprocess.Popen(
         [*launcher, *command], stdout=subprocess.PIPE, text=True, env=environment
-    )
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def first_line(process: subprocess.Popen[str]) -> str:
