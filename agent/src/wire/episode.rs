@@ -84,7 +84,7 @@ impl Episode {
         self.environment.reply_bytes
     }
 
-    /// Has the last reply sent once more; the world does not move. It costs what the wire costs, without a simulator.
+    /// Has the last reply sent once more; the world does not move, and nothing is written anew.
     pub async fn repeat(&mut self) -> Result<(), EnvironmentFault> {
         self.environment.ask_again("the last request again").await.map(drop)
     }
