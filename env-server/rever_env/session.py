@@ -151,8 +151,8 @@ class Session:
         image = transition.observation.image
         changes = None if self._whole_images else tiles.changes(self._last_image, image)
         self._last_image = image
-        changed_tiles, pixels = changes or (None, image.tobytes())
-        observation = self._observation(transition.observation, pixels)
+        changed_tiles, pixels = changes or (None, image.reshape(-1).data)
+        observation = self._observation(transition.observation, b"")
         judged = (
             transition.statistics,
             transition.reward,
@@ -160,10 +160,11 @@ class Session:
             transition.truncated,
         )
         data = protocol.stepped_in_layout(
-            sequence, observation, judged, changed_tiles, simulator_us
+            sequence, observation, pixels, judged, changed_tiles, simulator_us
         )
         if data is None:
-            stepped = protocol.Transition(observation, *judged)
+            whole = self._observation(transition.observation, bytes(pixels))
+            stepped = protocol.Transition(whole, *judged)
             message = protocol.Stepped(sequence, stepped, changed_tiles, simulator_us)
             data = protocol.REPLY.encode(message)
         return data

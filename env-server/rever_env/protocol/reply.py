@@ -122,24 +122,22 @@ class Faulted(Numbered):
 
 _PIXELS = b"\xa6pixels"
 _NO_PIXELS = _PIXELS + b"\xc4\x00"
-_BYTES_HEADERS = tuple(
-    (1 << 8 * struct.calcsize(form), mark, struct.Struct(">B" + form))
-    for mark, form in ((0xC4, "B"), (0xC5, "H"), (0xC6, "I"))
-)
+_BYTES_8, _BYTES_16, _BYTES_32 = (struct.Struct(">B" + form) for form in "BHI")
 _packer = msgpack.Packer(use_single_float=True)
 
 
 def stepped_in_layout(
     sequence: int,
     observation: Observation,
+    pixels: bytes | memoryview,
     judged: tuple[Statistics, float, bool, bool],
     changed_tiles: tuple[int, ...] | None,
     simulator_us: int,
 ) -> bytes | None:
     """What the codec writes of the same Stepped, or None where it has to say what is wrong.
 
-    judged: statistics, reward, terminated, truncated. The image's bytes and the tiles' numbers
-    belong together; tiles.changes gives them so.
+    pixels: in place of those of the observation's image. judged: statistics, reward, terminated,
+    truncated. The pixels and the tiles' numbers belong together; tiles.changes gives them so.
     Nearly all replies are one, and right after a control step nothing of Python's is in the
     processor's caches: this touches little of it.
     """
@@ -161,7 +159,12 @@ def stepped_in_layout(
             "Stepped": {
                 "sequence": sequence,
                 "transition": {
-                    "observation": vars(observation) | {"image": vars(image) | {"pixels": b""}},
+                    "observation": {
+                        "image": {"height": image.height, "width": image.width, "pixels": b""},
+                        "state": state,
+                        "instruction": observation.instruction,
+                        "expert_action": expert_action,
+                    },
                     "statistics": vars(statistics),
                     "reward": reward,
                     "terminated": terminated,
@@ -172,10 +175,15 @@ def stepped_in_layout(
             }
         }
     )
-    count = len(image.pixels)
+    count = len(pixels)
+    if count >= 1 << 16:
+        header = _BYTES_32.pack(0xC6, count)
+    elif count >= 1 << 8:
+        header = _BYTES_16.pack(0xC5, count)
+    else:
+        header = _BYTES_8.pack(0xC4, count)
     at = data.index(_NO_PIXELS)  # the first: nothing before it could hold so much
-    header = next(form.pack(mark, count) for end, mark, form in _BYTES_HEADERS if count < end)
-    return b"".join((data[:at], _PIXELS, header, image.pixels, data[at + len(_NO_PIXELS) :]))
+    return b"".join((data[:at], _PIXELS, header, pixels, data[at + len(_NO_PIXELS) :]))
 
 
 Reply = Observed | Stepped | Saved | Restored | Closed | Refused | Faulted
