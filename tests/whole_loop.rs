@@ -68,8 +68,14 @@ fn every_episode_leaves_a_record_and_a_label() {
 #[test]
 fn the_result_file_has_the_documented_shape() {
     let (_, result) = undisturbed();
-    assert_eq!(keys(result), ["decision_ms", "headroom", "paired", "rows", "versions"]);
-    assert_eq!(keys(&result["decision_ms"]), ["p50", "p95"]);
+    let parts =
+        ["decision_ms", "headroom", "paired", "rows", "simulator_ms", "step_ms", "versions"];
+    assert_eq!(keys(result), parts);
+    for time in ["decision_ms", "step_ms", "simulator_ms"] {
+        assert_eq!(keys(&result[time]), ["p50", "p95"], "{time}");
+    }
+    let p50 = |time: &str| result[time]["p50"].as_f64().expect("a number");
+    assert!(0.0 < p50("simulator_ms") && p50("simulator_ms") < p50("step_ms"), "{result}");
     let rows = result["rows"].as_array().expect("rows");
     // One per task and one for all, for each strategy.
     assert_eq!(rows.len(), (TASKS.len() + 1) * 2);
@@ -216,7 +222,7 @@ fn assert_same_episodes(ours: &Evaluation, theirs: &Evaluation) {
         let steps = |record: &EpisodeRecord| {
             let mut steps = record.steps.clone();
             for step in &mut steps {
-                (step.decision_ms, step.step_ms) = (0.0, 0.0);
+                (step.decision_ms, step.step_ms, step.simulator_ms) = (0.0, 0.0, None);
             }
             steps
         };

@@ -118,6 +118,10 @@ pub struct StepRecord {
     pub decision_ms: f32,
     /// From the action to the next observation.
     pub step_ms: f32,
+    /// Of `step_ms`, what the simulator says that it took: the rest are the wire and the server's other sessions. None
+    /// in a record from before simulators said so.
+    #[serde(default)]
+    pub simulator_ms: Option<f32>,
 }
 
 /// One sampled candidate. Its text is rebuilt from the tokens with the policy's tokenizer.
@@ -272,6 +276,7 @@ pub(crate) mod tests {
                 statistics: Statistics::default(),
                 decision_ms: 20.5,
                 step_ms: 4.0,
+                simulator_ms: Some(3.5),
             }],
             wall_secs: 1.5,
         }
@@ -292,6 +297,16 @@ pub(crate) mod tests {
         assert_eq!(record.score_mean(), Some(0.75));
         let arm = record.identity.arm().expect("an arm");
         assert_eq!(arm.to_string(), "verifier+medoid N=2 T=0.7");
+    }
+
+    #[test]
+    fn a_record_from_before_simulators_said_what_they_took_is_read() {
+        let mut record = made_up(3);
+        let mut value = serde_json::to_value(&record).expect("a value");
+        let step = value["steps"][0].as_object_mut().expect("a map");
+        assert!(step.remove("simulator_ms").is_some());
+        record.steps[0].simulator_ms = None;
+        assert_eq!(serde_json::from_value::<EpisodeRecord>(value).expect("a record"), record);
     }
 
     #[test]

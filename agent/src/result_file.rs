@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use serde::Serialize;
 use serde_json::Value;
 
-use crate::results::{DecisionTime, Rates, Results};
+use crate::results::{Rates, Results, StepTime};
 use crate::statistics::Rate;
 use crate::suite::{Arm, VARIANT_DEFAULT};
 
@@ -22,8 +22,12 @@ pub struct ResultFile {
     pub paired: Vec<Paired>,
     /// One entry per arm that chooses, where one sample and the oracle ran beside it.
     pub headroom: Vec<Headroom>,
-    /// None when nothing was decided.
-    pub decision_ms: Option<DecisionTime>,
+    /// Of a whole batch; none when nothing was decided.
+    pub decision_ms: Option<StepTime>,
+    /// From an action to the next observation.
+    pub step_ms: Option<StepTime>,
+    /// Of that, the simulator's own; none when no simulator said so.
+    pub simulator_ms: Option<StepTime>,
     /// Of everything that the results depend on, by name.
     pub versions: Value,
 }
@@ -128,6 +132,8 @@ impl ResultFile {
             paired: paired.collect(),
             headroom: headroom.collect(),
             decision_ms: results.decision_ms,
+            step_ms: results.step_ms,
+            simulator_ms: results.simulator_ms,
             versions,
         }
     }

@@ -23,8 +23,12 @@ pub struct Results {
     pub gains: Vec<ArmGain>,
     /// How far each arm went from one sample to the oracle.
     pub headroom: Vec<ArmHeadroom>,
-    /// Over all steps of all episodes; none without a step.
-    pub decision_ms: Option<DecisionTime>,
+    /// From the observations to the chosen actions of a whole batch.
+    pub decision_ms: Option<StepTime>,
+    /// From an action to the next observation, with the server's other sessions before it.
+    pub step_ms: Option<StepTime>,
+    /// The part of it that the simulator itself took.
+    pub simulator_ms: Option<StepTime>,
 }
 
 /// One arm on every task.
@@ -73,12 +77,12 @@ pub struct ArmHeadroom {
     pub fraction: f64,
 }
 
-/// Milliseconds from the observations to the chosen actions of a whole batch.
+/// Milliseconds over all steps of all episodes; there is none without a step.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
-pub struct DecisionTime {
+pub struct StepTime {
     /// Median.
     pub p50: f64,
-    /// 95 of 100 decisions are faster.
+    /// 95 of 100 are faster.
     pub p95: f64,
 }
 
@@ -107,7 +111,9 @@ impl Results {
         Ok(Results {
             gains: gains(&by_arm, &tasks),
             headroom: headroom(&by_arm),
-            decision_ms: decision_time(summaries),
+            decision_ms: step_time(summaries, |summary| &summary.decision_ms),
+            step_ms: step_time(summaries, |summary| &summary.step_ms),
+            simulator_ms: step_time(summaries, |summary| &summary.simulator_ms),
             arms: by_arm
                 .iter()
                 .map(|(arm, list)| arm_result(*arm, list, &broken, &tasks))
@@ -237,11 +243,14 @@ fn success(summary: &EpisodeSummary) -> f64 {
     f64::from(u8::from(summary.statistics.is_success))
 }
 
-fn decision_time(summaries: &[EpisodeSummary]) -> Option<DecisionTime> {
-    let all = summaries.iter().flat_map(|summary| &summary.decision_ms);
+fn step_time(
+    summaries: &[EpisodeSummary],
+    of: fn(&EpisodeSummary) -> &Vec<f32>,
+) -> Option<StepTime> {
+    let all = summaries.iter().flat_map(of);
     let mut all: Vec<f64> = all.map(|milliseconds| f64::from(*milliseconds)).collect();
     all.sort_by(f64::total_cmp);
-    (!all.is_empty()).then(|| DecisionTime { p50: quantile(&all, 0.50), p95: quantile(&all, 0.95) })
+    (!all.is_empty()).then(|| StepTime { p50: quantile(&all, 0.50), p95: quantile(&all, 0.95) })
 }
 
 #[cfg(test)]
@@ -277,6 +286,8 @@ mod tests {
             candidates: 2,
             wall_secs: 1.0,
             decision_ms: vec![10.0, 20.0],
+            step_ms: vec![6.0, 6.0],
+            simulator_ms: vec![],
         }
     }
 
@@ -310,6 +321,8 @@ mod tests {
         let [headroom] = &results.headroom[..] else { panic!("one arm: {:?}", results.headroom) };
         assert!((headroom.fraction - 1.0 / 3.0).abs() < 1e-12);
         assert_eq!(results.decision_ms.map(|time| time.p50), Some(15.0));
+        assert_eq!(results.step_ms.map(|time| time.p95), Some(6.0));
+        assert_eq!(results.simulator_ms, None, "no simulator said what it took");
     }
 
     #[test]

@@ -2,13 +2,13 @@
 
 use std::fmt::Write;
 
-use crate::results::{ArmResult, Rates, Results};
+use crate::results::{ArmResult, Rates, Results, StepTime};
 use crate::statistics::Rate;
 use crate::strategy::Strategy;
 
 /// All tables, one after the other. Every percentage carries its number of episodes or its interval.
 pub fn text(results: &Results) -> String {
-    let parts = [rates(results), gains(results), by_candidates(results), decisions(results)];
+    let parts = [rates(results), gains(results), by_candidates(results), times(results)];
     parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
 }
 
@@ -101,11 +101,19 @@ fn interval(rate: Rate) -> String {
     format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high)
 }
 
-fn decisions(results: &Results) -> String {
-    let line = |time: crate::results::DecisionTime| {
-        format!("decision of a whole batch: {:.0} ms (p50), {:.0} ms (p95)\n", time.p50, time.p95)
-    };
-    results.decision_ms.map(line).unwrap_or_default()
+fn times(results: &Results) -> String {
+    let times = [
+        ("  decision of a whole batch", results.decision_ms),
+        ("  control step after it", results.step_ms),
+        ("    its simulator's part", results.simulator_ms),
+    ];
+    let mut rows = vec![["milliseconds", "p50", "p95"].map(str::to_owned).to_vec()];
+    for (what, time) in times {
+        if let Some(StepTime { p50, p95 }) = time {
+            rows.push(vec![what.to_owned(), format!("{p50:.1}"), format!("{p95:.1}")]);
+        }
+    }
+    if rows.len() == 1 { String::new() } else { aligned(&rows) }
 }
 
 fn percent(rate: Rate) -> String {

@@ -114,6 +114,7 @@ fn record(identity: EpisodeIdentity, is_success: bool, random: &mut StdRng) -> E
                 statistics: statistics(late, grasped),
                 decision_ms: 21.5,
                 step_ms: 4.25,
+                simulator_ms: Some(3.75),
             }
         })
         .collect();

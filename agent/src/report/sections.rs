@@ -12,7 +12,7 @@ use super::page::Page;
 use super::scores::{Bin, Scored};
 use super::{bars, curve, forest, scores};
 use crate::calibration;
-use crate::results::{ArmGain, ArmResult, Rates, Results};
+use crate::results::{ArmGain, ArmResult, Rates, Results, StepTime};
 use crate::run::RunHeader;
 use crate::statistics::{Rate, auroc};
 use crate::strategy::Strategy;
@@ -54,8 +54,15 @@ fn head(header: &RunHeader, simulators: &BTreeSet<String>, results: &Results) ->
     let episodes: u64 = results.arms.iter().map(|arm| arm.all.success.trials).sum();
     let faults: u64 = results.arms.iter().map(|arm| arm.all.faults).sum();
     let mut facts = vec![("episodes", episodes.to_string()), ("faults", faults.to_string())];
-    if let Some(time) = results.decision_ms {
-        facts.push(("a decision takes", format!("{:.0} ms (p95 {:.0} ms)", time.p50, time.p95)));
+    let times = [
+        ("a decision takes", results.decision_ms),
+        ("a step takes", results.step_ms),
+        ("its simulator takes", results.simulator_ms),
+    ];
+    for (what, StepTime { p50, p95 }) in
+        times.into_iter().filter_map(|(what, time)| Some((what, time?)))
+    {
+        facts.push((what, format!("{p50:.1} ms (p95 {p95:.1} ms)")));
     }
     let simulators: Vec<&str> = simulators.iter().map(String::as_str).collect();
     facts.push(("simulator", simulators.join(", ")));

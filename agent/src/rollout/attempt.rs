@@ -139,6 +139,7 @@ impl Attempt {
             statistics: protocol::Statistics::default(),
             decision_ms: 0.0,
             step_ms: 0.0,
+            simulator_ms: None,
         });
         action
     }
@@ -157,6 +158,7 @@ impl Attempt {
             step.statistics = transition.statistics;
             step.decision_ms = decision_ms;
             step.step_ms = step_ms;
+            step.simulator_ms = Some(self.episode.simulator_time().as_secs_f32() * 1e3);
         }
         Ok(transition.terminated || transition.truncated)
     }

@@ -13,7 +13,7 @@ use crate::record::EpisodeRecord;
 /// The index's file in the run's folder.
 pub const INDEX: &str = "index.sqlite";
 /// Rises when summaries change; an index of another version is rebuilt.
-const INDEX_VERSION: i64 = 1;
+const INDEX_VERSION: i64 = 2;
 /// How long a writer waits for another process that reads.
 const WAIT_SECS: u64 = 30;
 
@@ -43,9 +43,9 @@ fn open_file(path: &Path) -> Result<Connection> {
         version == INDEX_VERSION || version == 0,
         "expected index version {INDEX_VERSION}, got {version}"
     );
+    index.pragma_update(None, "user_version", INDEX_VERSION)?;
     index.execute_batch(
         "PRAGMA synchronous = OFF; -- rebuildable
-         PRAGMA user_version = 1;
          CREATE TABLE IF NOT EXISTS episodes (
              id TEXT PRIMARY KEY, task TEXT NOT NULL, episode INTEGER NOT NULL, strategy TEXT NOT NULL,
              candidates INTEGER NOT NULL, temperature REAL NOT NULL, is_success INTEGER NOT NULL, summary TEXT NOT NULL)",

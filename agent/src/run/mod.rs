@@ -75,6 +75,10 @@ pub struct EpisodeSummary {
     pub wall_secs: f32,
     /// Of each step.
     pub decision_ms: Vec<f32>,
+    /// Of each step.
+    pub step_ms: Vec<f32>,
+    /// Of each step whose simulator said so.
+    pub simulator_ms: Vec<f32>,
 }
 
 /// One attempt that broke.
@@ -195,6 +199,8 @@ impl From<&EpisodeRecord> for EpisodeSummary {
             candidates: candidates().count() as u32,
             wall_secs: record.wall_secs,
             decision_ms: record.steps.iter().map(|step| step.decision_ms).collect(),
+            step_ms: record.steps.iter().map(|step| step.step_ms).collect(),
+            simulator_ms: record.steps.iter().filter_map(|step| step.simulator_ms).collect(),
         }
     }
 }

@@ -144,6 +144,7 @@ mod tests {
             statistics: Statistics::default(),
             decision_ms: 1.0,
             step_ms: 1.0,
+            simulator_ms: None,
         };
         let mut memory = Memory::default();
         let grasped = Statistics { is_grasped: true, ..Statistics::default() };

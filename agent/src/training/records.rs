@@ -160,6 +160,7 @@ mod tests {
             statistics: Statistics::default(),
             decision_ms: 1.0,
             step_ms: 1.0,
+            simulator_ms: None,
         };
         EpisodeRecord {
             version: RECORD_VERSION,
