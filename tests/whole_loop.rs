@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::process::Stdio;
 use std::sync::OnceLock;
 
 use agent::labels::LabelStore;
@@ -156,6 +157,20 @@ fn the_report_shows_every_episode() {
     for id in evaluation.records().keys() {
         assert!(written.contains(id.as_str()), "{id} is in the report");
     }
+}
+
+#[test]
+fn a_reader_that_has_seen_enough_is_no_defect() {
+    let (evaluation, _) = undisturbed();
+    let out = fresh_folder("unread");
+    let mut report = rever();
+    report.arg("report").arg(evaluation.run_folder()).arg("--out").arg(&out);
+    let mut child = report.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it runs");
+    drop(child.stdout.take());
+    let output = child.wait_with_output().expect("it ends");
+    assert!(out.join("index.html").exists(), "the page is made");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(!said.contains("panicked"), "{said}");
 }
 
 #[test]

@@ -7,6 +7,7 @@ use clap::Parser;
 use protocol::transport::{RUNTIME_POOL, RUNTIME_VARIABLE};
 
 fn main() -> ExitCode {
+    say_nothing_of_closed_pipes();
     keep_freed_memory();
     let_senders_finish();
     if std::env::var_os(RUNTIME_VARIABLE).is_none() {
@@ -25,6 +26,17 @@ fn main() -> ExitCode {
             ExitCode::from(1)
         }
     }
+}
+
+/// Whoever reads has seen enough, as in `rever ... | head`: that ends the program, and is no defect to be reported.
+fn say_nothing_of_closed_pipes() {
+    let report = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        let words = panic.payload_as_str().unwrap_or_default();
+        if !(words.starts_with("failed printing to std") && words.contains("Broken pipe")) {
+            report(panic);
+        }
+    }));
 }
 
 /// Linux stops whoever wakes another on the same processor, in the middle of a picture that it sends. Not among threads of

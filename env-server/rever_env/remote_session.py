@@ -13,6 +13,7 @@ import zenoh
 
 from rever_env import protocol
 from rever_env.protocol import tiles
+from rever_env.protocol.codec import M
 from rever_env.serving import Endpoints
 
 _LOOK_SECS = 0.2  # between looks at who is there
@@ -117,7 +118,10 @@ class RemoteSession:
             transition = reply.transition
             if reply.changed_tiles is not None:
                 observation = transition.observation
-                image = tiles.complete(observation.image, reply.changed_tiles, self._last_image)
+                try:
+                    image = tiles.complete(observation.image, reply.changed_tiles, self._last_image)
+                except ValueError as error:
+                    raise RemoteFault(f"server {self.server}: {error}") from None
                 observation = dataclasses.replace(observation, image=image)
                 transition = dataclasses.replace(transition, observation=observation)
                 reply = dataclasses.replace(reply, transition=transition, changed_tiles=None)
@@ -147,7 +151,7 @@ class RemoteSession:
         answers = list(self._network.get(key, payload=payload, timeout=_OPEN_SECS))
         if not answers or answers[0].ok is None:
             raise RemoteFault(f"server {description.server} did not answer Open")
-        opening = protocol.OPENING.decode(answers[0].ok.payload.to_bytes())
+        opening = self._read(protocol.OPENING, answers[0].ok.payload.to_bytes())
         if isinstance(opening, protocol.OpenRefused):
             raise RemoteRefused(opening.reason)
         name = opening.session
@@ -170,13 +174,16 @@ class RemoteSession:
         """The named server, or the one with most free sessions."""
         fleet = self._fleet
         key = self._keys.describe(fleet.server) if fleet.server else self._keys.describe_all()
+        strange = ""
         deadline = time.monotonic() + fleet.wait_secs
         while True:
-            found = [
-                protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes())
-                for reply in self._network.get(key, timeout=fleet.wait_secs)
-                if reply.ok is not None
-            ]
+            found = []
+            for reply in self._network.get(key, timeout=fleet.wait_secs):
+                if reply.ok is not None:
+                    try:
+                        found.append(protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes()))
+                    except protocol.CodecError as error:  # of another version, for instance
+                        strange = f"; one cannot be understood: {error}"
             free = [server for server in found if server.sessions < server.sessions_max]
             if free:
                 return max(free, key=lambda server: server.sessions_max - server.sessions)
@@ -184,7 +191,7 @@ class RemoteSession:
                 what = "none has a free session" if found else "none was to be seen"
                 raise RemoteFault(
                     f"servers of fleet {fleet.fleet} at {', '.join(fleet.connect)}: {what} "
-                    f"within {fleet.wait_secs:g} s"
+                    f"within {fleet.wait_secs:g} s{strange}"
                 )
             time.sleep(_LOOK_SECS)
 
@@ -203,9 +210,16 @@ class RemoteSession:
                 data = self._replies.get(timeout=max(deadline - time.monotonic(), 0.0))
             except queue.Empty:
                 return None
-            reply = protocol.REPLY.decode(data)
+            reply = self._read(protocol.REPLY, data)
             if reply.sequence in (self._sequence, 0):
                 return reply
+
+    def _read(self, codec: protocol.Codec[M], data: bytes) -> M:
+        """What cannot be understood is no outcome."""
+        try:
+            return codec.decode(data)
+        except protocol.CodecError as error:
+            raise RemoteFault(f"server {self.server}: {error}") from None
 
 
 def holder() -> str:

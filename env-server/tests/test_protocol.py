@@ -131,6 +131,7 @@ def codec_of(name: str) -> protocol.Codec[Any]:
 def reply_of(message: protocol.Stepped) -> bytes | None:
     """By the short way."""
     transition = message.transition
+    observation = transition.observation
     judged = (
         transition.statistics,
         transition.reward,
@@ -139,7 +140,8 @@ def reply_of(message: protocol.Stepped) -> bytes | None:
     )
     return protocol.stepped_in_layout(
         message.sequence,
-        transition.observation,
+        dataclasses.replace(observation, image=dataclasses.replace(observation.image, pixels=b"")),
+        observation.image.pixels,
         judged,
         message.changed_tiles,
         message.simulator_us,
@@ -193,6 +195,13 @@ def _seeing(**fields: Any) -> protocol.Stepped:
                 transition=dataclasses.replace(TRANSITION, reward=float("nan")),
             ),
             "reward: expected finite numbers, got nan",
+        ),
+        (
+            dataclasses.replace(
+                EXAMPLES["reply_stepped"],
+                transition=dataclasses.replace(TRANSITION, reward=-3.5e38),
+            ),
+            "reward: expected 32-bit numbers, got -3.5e[+]38 at index 0",
         ),
     ],
 )

@@ -20,7 +20,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import rever_env
-from rever_env import tasks
+from rever_env import protocol, tasks
 from rever_env.remote_session import RemoteFault, RemoteRefused
 from rever_env.server import Server, ServerOptions
 from rever_env.serving import Endpoints
@@ -198,6 +198,28 @@ def test_what_is_wrong_is_said(endpoint: str) -> None:
         remote.step(np.zeros(6, np.float32))
     with pytest.raises(ValueError, match="expected only 'configuration'"):
         remote.reset(options={"configuraton": 4})
+    remote.close()
+
+
+def test_a_reply_that_cannot_be_understood_is_a_fault_and_no_reward(endpoint: str) -> None:
+    remote = rever_env.RemoteEnv(endpoint, image_height=16, image_width=16)
+    remote.reset(seed=0)
+    transition = protocol.Transition(
+        protocol.Observation(protocol.Image(32, 32, b""), (0.0,) * 8, "", None),
+        protocol.Statistics(*[False] * 9),
+        0.0,
+        False,
+        False,
+    )
+    unlike = protocol.REPLY.encode(protocol.Stepped(4, transition, (), 0))  # the fourth request
+    session = remote.session
+    key = str(session._publisher.key_expr).removesuffix("request") + "reply"
+    for data, words in ((b"\xc1", "reply cannot be read"), (unlike, "16 x 16 pixels as before")):
+        session._network.put(key, data)  # a server's, as far as anyone can tell
+        with pytest.raises(RemoteFault, match=words):
+            remote.step(STILL)
+        remote.reset(seed=0)
+    remote.step(STILL)
     remote.close()
 
 

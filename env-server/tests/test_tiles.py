@@ -39,11 +39,18 @@ def test_changed_tiles_make_the_picture_whole_again() -> None:
     last = picture()
     # Rows of 144 bytes, of which a tile has 48: the corners of the tile in the middle above.
     corners = (48, 95, 15 * 144 + 48, 15 * 144 + 95)
-    assert sent(last, altered(last, *corners, 32 * 144 - 1)) == ((1, 5), 2 * 768)
+    assert sent(last, altered(last, *corners)) == ((1,), 768)
+    assert sent(last, altered(last, *corners, 32 * 144 - 49)) == ((1, 4), 2 * 768)
     for place in range(last.size):
         tile = place // 144 // 16 * 3 + place % 144 // 48
         assert sent(last, altered(last, place)) == ((tile,), 768), place
     assert sent(last, last) == ((), 0)
+
+
+def test_the_tiles_are_a_box_around_what_changed() -> None:
+    last = picture(48, 64)  # of 3 x 4 tiles, rows of 192 bytes
+    far_apart = altered(last, 191, 16 * 192 + 96, 17 * 192 + 95)  # in the tiles 3, 6 and 5
+    assert sent(last, far_apart) == ((1, 2, 3, 5, 6, 7), 6 * 768)
 
 
 def test_the_order_of_tiles_is_the_one_of_the_golden_file() -> None:

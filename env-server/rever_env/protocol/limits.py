@@ -18,6 +18,7 @@ DEPTH_MAX = 8  # maps and arrays inside one another
 ELEMENTS_MAX = 4096  # of an array or a map
 SLOTS_MAX = 16  # save slots of a session, numbered from 0
 SESSIONS_MAX = 256  # of one server process
+FLOAT_MAX = float.fromhex("0x1.fffffep127")  # of 32 bits, in which all of them are written
 SEED_END = 1 << 53  # first seed that is too large: seeds fit a double
 ACTION_DIMENSIONS_MAX = 128
 STATE_DIMENSIONS_MAX = ELEMENTS_MAX

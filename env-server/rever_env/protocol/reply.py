@@ -145,7 +145,7 @@ def stepped_in_layout(
     image, state, expert_action = observation.image, observation.state, observation.expert_action
     total = sum(state, reward) + sum(expert_action or ())  # not finite if one of them is not
     if (
-        not math.isfinite(total)
+        not (math.isfinite(total) and abs(reward) <= limits.FLOAT_MAX)
         or len(state) > limits.STATE_DIMENSIONS_MAX
         or len(observation.instruction) > limits.TEXT_BYTES_MAX // 4  # characters of up to 4 bytes
         or (expert_action is not None and len(expert_action) not in _ACTION_LENGTHS)

@@ -48,10 +48,12 @@ def length(field: str, values: Sized, low: int, high: int) -> None:
 
 
 def finite(field: str, values: tuple[float, ...]) -> None:
-    """Numbers without NaN and infinity."""
+    """Numbers without NaN and infinity, nor any that would become infinite in 32 bits."""
     for index, number in enumerate(values):
         if not math.isfinite(number):
             raise ValueError(f"{field}: expected finite numbers, got {number} at index {index}")
+        if abs(number) > limits.FLOAT_MAX:
+            raise ValueError(f"{field}: expected 32-bit numbers, got {number} at index {index}")
 
 
 def range(field: str, value: int, low: int, high: int) -> None:
