@@ -7,6 +7,7 @@ from importlib import metadata
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,7 @@ from rever_env.placement import check_configuration
 from rever_env.protocol import Dimension
 from rever_env.spaces import dimensions_of, images_of, numbers_of, value_of
 from rever_env.success import success_alone
-from rever_env.world import Observation, Transition
+from rever_env.world import Observation, Transition, divergence
 
 _SUCCESSES = ("is_success", "success")
 _SEED_END = 1 << 32  # numpy's older generators take no larger one
@@ -229,6 +230,11 @@ class GymnasiumWorld:
         return [self._numbers(), *(picture.copy() for picture in pictures)]
 
     def _observe(self) -> Observation:
+        data = getattr(self._environment.unwrapped, "data", None)
+        warnings = divergence(data) if isinstance(data, mujoco.MjData) else []
+        if warnings:
+            self._start = None
+            raise PhysicsDiverged(f"task {self.task.name}: MuJoCo started anew after {warnings}")
         numbers = self._numbers()
         for dimension, number in zip(self.task.state, numbers.tolist(), strict=True):
             if not np.isfinite(number):

@@ -16,7 +16,7 @@ from rever_env.placement import check_configuration
 from rever_env.pose import in_base
 from rever_env.protocol import Dimension, Statistics
 from rever_env.success import success_alone
-from rever_env.world import DOWN, Observation, Transition
+from rever_env.world import DOWN, Observation, Transition, broken
 
 # What robosuite's documentation says each task is about.
 _INSTRUCTIONS = {
@@ -208,6 +208,7 @@ class RobosuiteWorld:
         else:
             self._seed(seed)
             observation = environment.reset()
+        self._check_physics(0)
         self._steps, self._ever_success = 0, False
         return self._observe(observation)
 
@@ -237,11 +238,8 @@ class RobosuiteWorld:
         else:
             command = np.clip(action, *self._environment.action_spec)
         observation, reward, _, _ = self._environment.step(command)
-        data = self._environment.sim.data
-        if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
-            self._steps = None
-            raise PhysicsDiverged(f"physics of {self.task.name} at step {steps}: got NaN")
         self._steps = steps + 1
+        self._check_physics(self._steps)
         return Transition(
             observation=self._observe(observation),
             statistics=self._judged(),
@@ -249,6 +247,13 @@ class RobosuiteWorld:
             terminated=False,
             truncated=self._steps >= self.task.steps_max,
         )
+
+    def _check_physics(self, steps: int) -> None:
+        sim = self._environment.sim
+        words = broken(sim.model._model, sim.data._data)
+        if words:
+            self._steps = None
+            raise PhysicsDiverged(f"physics of {self.task.name} at step {steps}: {words}")
 
     def _judged(self) -> Statistics:
         """Of its own tasks robosuite knows success alone."""

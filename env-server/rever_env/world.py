@@ -240,18 +240,10 @@ class World:
     def _refresh(self) -> None:
         """Brings poses and contacts up to date, and looks whether the physics is still sound."""
         self._forward()
-        speeds = np.abs(self.data.qvel)
-        fastest = int(speeds.argmax())
-        speed = float(speeds[fastest])
-        warnings = self.data.warning.number
-        diverged = [name for index, name in _DIVERGENCE.items() if warnings[index] > 0]
-        if diverged or not np.isfinite(self.data.qpos).all() or not speed <= _SPEED_MAX:
+        words = broken(self.model, self.data)
+        if words:
             self.memory = None
-            raise PhysicsDiverged(
-                f"physics of {self.task.name} at step {self.steps}: expected finite speeds up to "
-                f"{_SPEED_MAX}, got {speed} of degree of freedom {fastest} of joint "
-                f"{self.model.joint(self.model.dof_jntid[fastest]).name} with warnings {diverged}"
-            )
+            raise PhysicsDiverged(f"physics of {self.task.name} at step {self.steps}: {words}")
 
     def _observe(self) -> Observation:
         return Observation(
@@ -267,6 +259,29 @@ class World:
             data.xpos[base], data.xmat[base], data.site_xpos[tcp], data.site_xmat[tcp], DOWN
         )
         return np.array([*pose, 0.0, self.gripper_opening()], np.float32)
+
+
+def broken(model: mujoco.MjModel, data: mujoco.MjData) -> str:
+    """Why the physics is not sound, or nothing if it is."""
+    speeds = np.abs(data.qvel)
+    fastest = int(speeds.argmax())
+    speed = float(speeds[fastest])
+    warnings = divergence(data)
+    if not warnings and speed <= _SPEED_MAX and np.isfinite(data.qpos).all():
+        return ""
+    return (
+        f"expected finite speeds up to {_SPEED_MAX}, got {speed} of degree of freedom {fastest} of "
+        f"joint {model.joint(model.dof_jntid[fastest]).name} with warnings {warnings}"
+    )
+
+
+def divergence(data: mujoco.MjData) -> list[str]:
+    """Warnings since the last reset that the physics diverged.
+
+    Where MuJoCo finds that, it starts anew from the model's defaults, and all is finite again.
+    """
+    counts = data.warning.number
+    return [name for index, name in _DIVERGENCE.items() if counts[index] > 0]
 
 
 def place_objects(

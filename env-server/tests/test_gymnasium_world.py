@@ -263,3 +263,17 @@ def test_an_environment_that_breaks_or_does_not_repeat_itself_is_a_fault() -> No
             world.step(np.array([0.0]))
     finally:
         del gymnasium.registry["rever-tests/Fickle-v0"]
+
+
+def test_physics_that_started_anew_is_a_fault() -> None:
+    """MuJoCo resets what has diverged by itself: nothing in the observation tells."""
+    world = make("Hopper-v5", 0, 0)
+    world.reset(configuration=None, seed=0)
+    still = np.zeros(len(world.task.action))
+    world.step(still)
+    environment: Any = world._environment.unwrapped
+    environment.data.qvel[0] = 1e12
+    with pytest.raises(PhysicsDiverged, match="mjWARN_BADQVEL"):
+        world.step(still)
+    world.reset(configuration=None, seed=0)
+    world.step(still)

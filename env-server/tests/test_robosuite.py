@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rever_env import tasks
-from rever_env.fault import InvalidAction, InvalidPlacement
+from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
 from rever_env.world import Observation, World
 
 pytest.importorskip("robosuite")
@@ -88,6 +88,20 @@ def test_what_is_wrong_is_said(worlds: list[RobosuiteWorld]) -> None:
         # What is refused changes nothing: the episode is still at its end.
         with pytest.raises(InvalidPlacement, match="configuration 0"):
             world.reset(configuration=0, seed=0)
+
+
+def test_physics_that_started_anew_is_a_fault(worlds: list[RobosuiteWorld]) -> None:
+    """MuJoCo resets what has diverged by itself: nothing that robosuite gives tells."""
+    world = worlds[0]
+    expected = run(world, 2)
+    world.reset(configuration=None, seed=2)
+    world.step(MOVE)
+    world._environment.sim.data._data.qvel[0] = 1e12
+    with pytest.raises(PhysicsDiverged, match="mjWARN_BADQVEL"):
+        world.step(MOVE)
+    with pytest.raises(InvalidAction, match="before reset"):
+        world.step(MOVE)
+    assert all(same(*pair) for pair in zip(expected, run(world, 2), strict=True))
 
 
 def test_two_arms_take_robosuites_own_actions() -> None:
