@@ -61,6 +61,16 @@ def drifts() -> None:
         return original(self, replace(request, seed=request.seed + 1000 * next(count)))
 
 
+def breaks_first_reset() -> None:
+    count = itertools.count()
+
+    @wrap(Session, "_reset")
+    def reset(original: Any, self: Any, request: protocol.Reset) -> Any:
+        if next(count) == 0:
+            raise world.PhysicsDiverged("made up")
+        return original(self, request)
+
+
 def one_seed() -> None:
     @wrap(Session, "_reset")
     def reset(original: Any, self: Any, request: protocol.Reset) -> Any:
@@ -182,6 +192,7 @@ DEFECTS = {
         forgets_tile,
         overstates_time,
         any_length,
+        breaks_first_reset,
     )
 }
 

@@ -3,27 +3,31 @@
 use std::path::Path;
 
 use agent::policy::{DeviceName, Policy};
+use agent::record::EpisodeRecord;
 use agent::training::{LabelledEpisode, TrainingSet, train};
 use agent::verifier::{Options, Verifier};
 use agent::wire::{Network, NetworkOptions, VerifierPublisher};
 
-use crate::evaluation::Evaluation;
-use crate::harness::repository;
+use crate::evaluation::{Evaluation, WAIT};
+use crate::harness::{repository, wait_for};
 use crate::server::free_endpoint;
 
 const EPISODES: usize = 6;
+/// Of the policy that comes with the program.
+const HIDDEN_SIZE: usize = 256;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_published_verifier_is_taken_up_between_episodes() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = repository().join("agent/models/bridge-small");
     let policy = Policy::load(&model, DeviceName::Cpu).expect("a policy");
-    let (first, second) = (verifier(&policy, 1), verifier(&policy, 2));
+    let (first, second) = (verifier(policy.digest(), 1), verifier(policy.digest(), 2));
     let path = folder.path().join("first.safetensors");
     std::fs::write(&path, first.bytes()).expect("the first verifier is written");
 
     let endpoint = free_endpoint();
-    let evaluation = evaluation(folder.path(), &endpoint, &path);
+    let named = format!("--verifier={}", path.display());
+    let evaluation = evaluation(folder.path(), &endpoint, &[&named]);
     let mut running = evaluation.start();
     evaluation.wait_for_records(&mut running, 1);
     let options = NetworkOptions { connect: vec![endpoint], ..NetworkOptions::default() };
@@ -43,7 +47,33 @@ async fn a_published_verifier_is_taken_up_between_episodes() {
     assert!(used[change..].iter().all(|digest| digest == second.digest()));
 }
 
-fn evaluation(folder: &Path, endpoint: &str, verifier: &Path) -> Evaluation {
+#[tokio::test(flavor = "multi_thread")]
+async fn a_verifier_of_another_policy_is_not_taken_for_the_first() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let model = repository().join("agent/models/bridge-small");
+    let policy = Policy::load(&model, DeviceName::Cpu).expect("a policy");
+    let (foreign, fitting) = (verifier(&"0".repeat(64), 1), verifier(policy.digest(), 2));
+    let endpoint = free_endpoint();
+    let evaluation = evaluation(folder.path(), &endpoint, &[]);
+    let running = evaluation.start();
+    let has_said = |words: &str| evaluation.words().contains(words).then_some(());
+    wait_for("the agent", WAIT, || has_said("verifiers are awaited"));
+    let options = NetworkOptions { connect: vec![endpoint], ..NetworkOptions::default() };
+    let network = Network::open(options).await.expect("the agent is reached");
+    let publisher = VerifierPublisher::declare(&network, "live").await.expect("a publisher");
+    let other = "0".repeat(64);
+    publisher.publish(&other, foreign.bytes().to_vec()).await.expect("it is published");
+    wait_for("a refusal", WAIT, || has_said("is ignored"));
+    publisher.publish(policy.digest(), fitting.bytes().to_vec()).await.expect("it is published");
+    assert!(running.succeeds(), "{}", evaluation.words());
+    let records = evaluation.records();
+    assert_eq!(records.len(), EPISODES);
+    let used =
+        |record: &EpisodeRecord| record.versions.verifier.as_deref() == Some(fitting.digest());
+    assert!(records.values().all(used));
+}
+
+fn evaluation(folder: &Path, endpoint: &str, more: &[&str]) -> Evaluation {
     let arguments = [
         "--tasks=widowx_spoon_on_towel",
         "--strategies=verifier",
@@ -53,14 +83,13 @@ fn evaluation(folder: &Path, endpoint: &str, verifier: &Path) -> Evaluation {
         "--servers=1",
         "--follow-verifier=live",
         &format!("--listen={endpoint}"),
-        &format!("--verifier={}", verifier.display()),
     ];
-    Evaluation::new(folder, &arguments)
+    Evaluation::new(folder, &[&arguments, more].concat())
 }
 
 /// Fitted to random numbers: what it says does not matter here, only which one it is.
-fn verifier(policy: &Policy, seed: u64) -> Verifier {
-    let size = policy.hidden_size();
+fn verifier(policy: &str, seed: u64) -> Verifier {
+    let size = HIDDEN_SIZE;
     let episodes = (0..20).map(|number| {
         let value = |index: usize| ((index * 7919 + number * 104_729) % 1000) as f32 / 1000.0;
         LabelledEpisode {
@@ -76,5 +105,5 @@ fn verifier(policy: &Policy, seed: u64) -> Verifier {
     });
     let set = TrainingSet::new(size, episodes).expect("a training set");
     let options = Options { seed, epochs_max: 1, ..Options::default() };
-    train(&set, policy.digest(), &options, |_| ()).expect("it can be trained")
+    train(&set, policy, &options, |_| ()).expect("it can be trained")
 }

@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::net::{Ipv4Addr, TcpListener};
 use std::process::{Child, Stdio};
 
-use crate::harness::python;
+use crate::harness::{python, repository};
 
 /// Running until it is dropped.
 pub struct Server {
@@ -25,19 +25,28 @@ impl Server {
     /// Starts a server that connects to `connect`, and waits until it says that it is ready.
     pub fn start(connect: &str, fleet: &str, arguments: &[&str]) -> Self {
         let endpoint = free_endpoint();
-        Self::start_with(connect, fleet, &[&["--listen", &endpoint], arguments].concat(), &endpoint)
+        let arguments = [&["--fleet", fleet, "--listen", &endpoint], arguments].concat();
+        Self::start_with(&["-m", "rever_env"], connect, &arguments, &endpoint)
     }
 
     /// The same, listening nowhere: for a router that `connect` names.
-    pub fn start_behind_router(connect: &str, fleet: &str) -> Self {
-        Self::start_with(connect, fleet, &[], connect)
+    pub fn start_behind_router(connect: &str, fleet: &str, arguments: &[&str]) -> Self {
+        let arguments = [&["--fleet", fleet], arguments].concat();
+        Self::start_with(&["-m", "rever_env"], connect, &arguments, connect)
     }
 
-    fn start_with(connect: &str, fleet: &str, arguments: &[&str], endpoint: &str) -> Self {
+    /// One with a defect of `broken_server.py`.
+    pub fn start_broken_behind_router(connect: &str, fleet: &str, defect: &str) -> Self {
+        let script = repository().join("tests/broken_server.py");
+        let program = [script.to_str().expect("a path in UTF-8"), defect];
+        Self::start_with(&program, connect, &["--fleet", fleet], connect)
+    }
+
+    fn start_with(program: &[&str], connect: &str, arguments: &[&str], endpoint: &str) -> Self {
         let mut command = python().command();
         command
-            .args(["-m", "rever_env", "serve", "--exit-with-parent", "--connect", connect])
-            .args(["--fleet", fleet])
+            .args(program)
+            .args(["serve", "--exit-with-parent", "--connect", connect])
             .args(arguments)
             .stdin(Stdio::null())
             .stdout(Stdio::piped());

@@ -205,13 +205,43 @@ fn servers_elsewhere_are_reached_through_a_router() {
     let endpoint = free_endpoint();
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     let router = runtime.block_on(open_router(&endpoint));
-    let _servers = [(); 2].map(|()| Server::start_behind_router(&endpoint, "elsewhere"));
+    let _servers = [(); 2].map(|()| Server::start_behind_router(&endpoint, "elsewhere", &[]));
     let there = ["--fleet=elsewhere", &format!("--connect={endpoint}")];
     succeed(rever().arg("doctor").args(there));
     let evaluation =
         Evaluation::new(&fresh_folder("elsewhere"), &[&ARGUMENTS[..], &there].concat());
     evaluation.finish();
     assert_same_episodes(&evaluation, undisturbed);
+    runtime.block_on(async { router.close().await }).expect("the router closes");
+}
+
+#[test]
+fn a_reset_that_breaks_is_repeated_and_another_simulator_is_left_out() {
+    let endpoint = free_endpoint();
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    let router = runtime.block_on(open_router(&endpoint));
+    let _stranger =
+        Server::start_behind_router(&endpoint, "mixed", &["--gymnasium", "CartPole-v1"]);
+    let _ours = Server::start_broken_behind_router(&endpoint, "mixed", "breaks_first_reset");
+    let arguments = [
+        "--fleet=mixed",
+        &format!("--connect={endpoint}"),
+        "--tasks=widowx_spoon_on_towel",
+        "--strategies=sample",
+        "--placements=random",
+        "--seed=7",
+        "--episodes=2",
+        // Nothing else goes on while the reset breaks.
+        "--sessions=1",
+    ];
+    let evaluation = Evaluation::new(&fresh_folder("mixed"), &arguments);
+    assert!(evaluation.start().succeeds(), "{}", evaluation.words());
+    assert_eq!(evaluation.records().len(), 2);
+    let faults = agent::run::faults(&evaluation.run_folder()).expect("a list");
+    assert_eq!(faults.len(), 1, "{faults:?}");
+    assert!(faults[0].reason.contains("made up"), "{faults:?}");
+    let said = evaluation.words();
+    assert!(said.contains("expected the run's simulator") && said.contains("left out"), "{said}");
     runtime.block_on(async { router.close().await }).expect("the router closes");
 }
 

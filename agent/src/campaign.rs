@@ -21,10 +21,12 @@ use crate::site::Site;
 use crate::stop::{self, Stop};
 use crate::suite::{Arm, EpisodePlan, Suite, VARIANT_DEFAULT};
 use crate::verifier::Verifier;
-use crate::wire::{Network, OutcomePublisher, VerifierSubscriber};
+use crate::wire::{Network, OutcomePublisher, ServerDescription, VerifierSubscriber};
 
 /// Servers run already; this is for the way to them.
 const SERVERS_WAIT: Duration = Duration::from_secs(30);
+/// After some of them have.
+const OTHERS_WAIT: Duration = Duration::from_secs(2);
 /// A run that needs a verifier and follows one waits this long for the first.
 const VERIFIER_WAIT: Duration = Duration::from_secs(60);
 
@@ -180,16 +182,17 @@ impl Campaign {
         let name = run.header.run.clone();
         let outcomes = OutcomePublisher::declare(network, &name).await?;
         let collector = Collector::start(network, &run, labels).await?;
-        let mut follower = match &self.follow_verifier {
+        let follower = match &self.follow_verifier {
             Some(name) => Some(VerifierSubscriber::declare(network, name).await?),
             None => None,
         };
-        if let (Some(follower), None) = (&mut follower, &verifier) {
-            self.first_verifier(follower).await?;
-        }
         if follower.is_some() {
             eprintln!("verifiers are awaited at {}", network.listening().join(", "));
         }
+        let verifier = match (&follower, verifier) {
+            (Some(follower), None) => self.first_verifier(follower, policy).await?,
+            (_, named) => named,
+        };
         let updates = follower.as_ref().map(|follower| {
             let mut latest = follower.latest();
             latest.mark_changed();
@@ -217,17 +220,27 @@ impl Campaign {
 
     /// A task that nobody offers would break every one of its episodes. Gives the number of servers.
     async fn check_tasks(&self, network: &Network) -> Result<usize> {
-        let servers = network.servers(self.site.servers.max(1), SERVERS_WAIT).await;
+        let mut servers = network.servers(self.site.servers.max(1), SERVERS_WAIT).await;
         ensure!(!servers.is_empty(), "no server was to be seen at {:?}", self.site.connect);
-        let offered: BTreeSet<&str> = servers
+        let offers = |server: &ServerDescription| {
+            let is_offered = |task: &String| server.tasks.iter().any(|offer| offer.task == *task);
+            self.suite.tasks.iter().all(is_offered)
+        };
+        if !servers.iter().any(offers) {
+            // A fleet may have servers of other simulators, and one of them may have answered first.
+            servers = network.servers(servers.len() + 1, OTHERS_WAIT).await;
+        }
+        let offered: BTreeSet<(&str, &str)> = servers
             .iter()
             .flat_map(|server| &server.tasks)
-            .filter(|offer| offer.variant == VARIANT_DEFAULT)
-            .map(|offer| offer.task.as_str())
+            .map(|offer| (offer.task.as_str(), offer.variant.as_str()))
             .collect();
-        let missing = self.suite.tasks.iter().find(|task| !offered.contains(task.as_str()));
-        if let Some(task) = missing {
-            bail!("task: expected one of {}, got {task}", Vec::from_iter(offered).join(", "));
+        let is_missing = |task: &&String| !offered.contains(&(task.as_str(), VARIANT_DEFAULT));
+        if let Some(task) = self.suite.tasks.iter().find(is_missing) {
+            let words = |(task, variant): &(&str, &str)| format!("{task} ({variant})");
+            let offered: Vec<String> = offered.iter().map(words).collect();
+            let offered = offered.join(", ");
+            bail!("task: expected one of {offered}, got {task} ({VARIANT_DEFAULT})");
         }
         Ok(servers.len())
     }
@@ -238,18 +251,34 @@ impl Campaign {
         Progress::new(&self.title, total as u64, done.len() as u64, successes as u64)
     }
 
-    async fn first_verifier(&self, follower: &VerifierSubscriber) -> Result<()> {
+    /// The first one published that fits the policy, where a strategy cannot begin without.
+    async fn first_verifier(
+        &self,
+        follower: &VerifierSubscriber,
+        policy: &Policy,
+    ) -> Result<Option<Arc<Verifier>>> {
         if !self.arms.iter().any(|arm| arm.strategy.needs_verifier()) {
-            return Ok(());
+            return Ok(None);
         }
         let mut latest = follower.latest();
-        let first = latest.wait_for(Option::is_some);
-        let first = tokio::time::timeout(VERIFIER_WAIT, first).await;
+        let fitting = async {
+            loop {
+                let update = latest.borrow_and_update().clone();
+                if let Some(update) = update {
+                    match Verifier::from_bytes(&update.weights, policy.digest()) {
+                        Ok(verifier) => return Ok(Some(Arc::new(verifier))),
+                        Err(error) => {
+                            tracing::warn!("the verifier {} is ignored: {error:#}", update.name);
+                        }
+                    }
+                }
+                latest.changed().await.context("the network is closed")?;
+            }
+        };
         let secs = VERIFIER_WAIT.as_secs();
-        first
-            .with_context(|| format!("no verifier was published within {secs} s"))?
-            .map(drop)
-            .context("the network is closed")
+        tokio::time::timeout(VERIFIER_WAIT, fitting)
+            .await
+            .with_context(|| format!("no verifier for this policy was published within {secs} s"))?
     }
 
     fn report(&self, folder: &Path, plans: &[EpisodePlan], was_stopped: bool) -> Result<Report> {

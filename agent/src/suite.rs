@@ -161,7 +161,9 @@ impl fmt::Display for Arm {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.strategy {
             Strategy::Greedy => write!(formatter, "greedy"),
-            Strategy::Sample => write!(formatter, "sample T={}", self.temperature),
+            Strategy::Sample if self.candidates == 1 => {
+                write!(formatter, "sample T={}", self.temperature)
+            }
             strategy => {
                 write!(formatter, "{strategy} N={} T={}", self.candidates, self.temperature)
             }
@@ -250,6 +252,8 @@ mod tests {
             &[1.0, 0.7],
             &[1, 2, 5],
         );
+        let drawn = Arm { strategy: Strategy::Sample, candidates: 5, temperature: 1.0 };
+        assert_eq!(drawn.to_string(), "sample N=5 T=1", "as collected, to be compared");
         let names: Vec<String> = arms.iter().map(Arm::to_string).collect();
         let expected = [
             "greedy",

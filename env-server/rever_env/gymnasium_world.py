@@ -22,7 +22,7 @@ from rever_env.placement import check_configuration
 from rever_env.protocol import Dimension
 from rever_env.spaces import dimensions_of, images_of, numbers_of, value_of
 from rever_env.success import success_alone
-from rever_env.world import Observation, Transition, divergence
+from rever_env.world import Observation, Transition, divergence, silence_warnings
 
 _SUCCESSES = ("is_success", "success")
 _SEED_END = 1 << 32  # numpy's older generators take no larger one
@@ -111,6 +111,7 @@ class GymnasiumWorld:
     """
 
     def __init__(self, task: GymnasiumTask, image_height: int, image_width: int) -> None:
+        silence_warnings()
         self.task = task
         self._size = (image_height, image_width)
         wants_image = self._size != (0, 0)

@@ -16,7 +16,7 @@ from rever_env.placement import check_configuration
 from rever_env.pose import in_base
 from rever_env.protocol import Dimension, Statistics
 from rever_env.success import success_alone
-from rever_env.world import DOWN, Observation, Transition, broken
+from rever_env.world import DOWN, Observation, Transition, broken, silence_warnings
 
 # What robosuite's documentation says each task is about.
 _INSTRUCTIONS = {
@@ -171,6 +171,7 @@ class RobosuiteWorld:
     def __init__(self, task: RobosuiteTask, image_height: int, image_width: int) -> None:
         import robosuite
 
+        silence_warnings()
         self.task = task
         self._size = (image_height, image_width)
         has_image = self._size != (0, 0)

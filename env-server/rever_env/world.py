@@ -81,9 +81,7 @@ class World:
     """One task in MuJoCo with its camera. Not thread-safe: use it in the thread that made it."""
 
     def __init__(self, task: Task, image_height: int = 128, image_width: int = 128) -> None:
-        # The warning counters are read after each step; MuJoCo's own handler would also append to
-        # a log file in whatever folder the process runs in.
-        mujoco.set_mju_user_warning(_ignore)
+        silence_warnings()
         self.task = task
         self.model = mujoco.MjModel.from_xml_path(str(task.scene))
         assert self.model.opt.timestep == task.settings.timestep, "scene and tasks.toml disagree"
@@ -301,8 +299,12 @@ def place_objects(
         data.qpos[start + 3 : start + 7] = quaternion
 
 
-def _ignore(_warning: object) -> None:
-    pass
+def silence_warnings() -> None:
+    """Their counters are read after each step.
+
+    MuJoCo's own handler would also append to a log file in whatever folder the process runs in.
+    """
+    mujoco.set_mju_user_warning(lambda _: None)
 
 
 def _checked(action: NDArray[np.float64]) -> NDArray[np.float64]:

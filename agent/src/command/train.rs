@@ -8,6 +8,7 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use serde::Serialize;
 
+use super::episodes::policy_folder;
 use crate::policy::{DeviceName, Policy};
 use crate::record::write_whole;
 use crate::table::aligned;
@@ -27,9 +28,9 @@ pub struct Arguments {
     /// Label store to learn from; what is not fit to teach is set aside and counted
     #[arg(long, default_value = "runs/labels.sqlite", conflicts_with = "runs")]
     labels: PathBuf,
-    /// Folder of the policy whose hidden states the records hold
-    #[arg(long, default_value = "agent/models/bridge-small")]
-    policy: PathBuf,
+    /// Folder of the policy whose hidden states the records hold, instead of the one that comes with the program
+    #[arg(long, value_name = "FOLDER")]
+    policy: Option<PathBuf>,
     /// Where to write the verifier
     #[arg(long, default_value = "verifier.safetensors")]
     out: PathBuf,
@@ -93,7 +94,8 @@ struct ResultFile<'a> {
 /// Trains, prints, writes, publishes.
 pub fn run(arguments: Arguments) -> Result<()> {
     let started = Instant::now();
-    let policy = Policy::load(&arguments.policy, DeviceName::Cpu)?;
+    let policy = policy_folder(arguments.policy.as_ref())?;
+    let policy = Policy::load(&policy, DeviceName::Cpu)?;
     let action_scale = policy.action_scale();
     let confidence =
         |tokens: &[u32], log_probabilities: &[f32]| policy.confidence(tokens, log_probabilities);

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
-use protocol::{Open, PROTOCOL_VERSION};
+use protocol::{Open, PROTOCOL_VERSION, TaskDescription};
 
 use super::attempt::Seat;
 use super::queue::Job;
@@ -21,6 +21,8 @@ const LOOK_WAIT: Duration = Duration::from_secs(2);
 const LOOK_EVERY: Duration = Duration::from_secs(5);
 /// How often it looks for more than it has ever had.
 const LOOK_EVERY_WHEN_COMPLETE: Duration = Duration::from_secs(30);
+/// A server that did not answer in time may do so again: before a run that waits for it gives up.
+const AVOIDED_FOR: Duration = Duration::from_secs(30);
 
 /// Opens sessions and keeps those that are free.
 pub struct Crew<'a> {
@@ -33,8 +35,12 @@ pub struct Crew<'a> {
     servers: Vec<ServerDescription>,
     /// The most that lived at once; with fewer, more may come.
     servers_max: usize,
-    /// Servers that live but do not work.
-    avoided: BTreeSet<String>,
+    /// Servers that did not answer in time, and since when they are left alone.
+    avoided: BTreeMap<String, Instant>,
+    /// Servers with another simulator.
+    strangers: BTreeSet<String>,
+    /// Whether one with the run's simulator has been there.
+    servers_seen: bool,
     free: Vec<(Seat, Environment)>,
     /// Sessions of this run by server.
     in_use: BTreeMap<String, usize>,
@@ -60,7 +66,9 @@ impl<'a> Crew<'a> {
             simulator,
             servers: Vec::new(),
             servers_max: servers,
-            avoided: BTreeSet::new(),
+            avoided: BTreeMap::new(),
+            strangers: BTreeSet::new(),
+            servers_seen: false,
             free: Vec::new(),
             in_use: BTreeMap::new(),
             looked: None,
@@ -71,7 +79,7 @@ impl<'a> Crew<'a> {
     /// when none comes.
     pub async fn seat(&mut self, job: &Job, must: bool) -> Result<Option<(Seat, Environment)>> {
         let is_short = self.servers.len() < self.servers_max;
-        self.look(if is_short { LOOK_EVERY } else { LOOK_EVERY_WHEN_COMPLETE }, 1).await?;
+        self.look(job, if is_short { LOOK_EVERY } else { LOOK_EVERY_WHEN_COMPLETE }, 1).await?;
         // All servers of a run are of one simulator: another one would not fit better.
         if let Some(reason) = self.servers.iter().find_map(|server| unfit(server, job)) {
             bail!("{reason}");
@@ -103,14 +111,19 @@ impl<'a> Crew<'a> {
                 Instant::now() < deadline,
                 "no session was to be had within {} s: {}",
                 SERVER_WAIT.as_secs(),
-                if refusals.is_empty() {
-                    "no server lives".to_owned()
-                } else {
-                    refusals.join("; ")
-                }
+                self.absent(refusals)
             );
-            self.look(Duration::ZERO, self.servers.len() + 1).await?;
+            self.look(job, Duration::ZERO, self.servers.len() + 1).await?;
         }
+    }
+
+    /// Why there is no session.
+    fn absent(&self, mut reasons: Vec<String>) -> String {
+        let slow = self.avoided.keys();
+        reasons.extend(slow.map(|server| format!("server {server} did not answer in time")));
+        let others = self.strangers.iter();
+        reasons.extend(others.map(|server| format!("server {server} has another simulator")));
+        if reasons.is_empty() { "no server lives".to_owned() } else { reasons.join("; ") }
     }
 
     /// Takes back the session of an episode that ended well.
@@ -131,7 +144,7 @@ impl<'a> Crew<'a> {
         let is_server_lost = match fault {
             EnvironmentFault::ServerLost { .. } => true,
             EnvironmentFault::TimedOut { .. } => {
-                self.avoided.insert(seat.server.clone());
+                self.avoided.insert(seat.server.clone(), Instant::now());
                 if let Some(local) = self.local {
                     local.replace(&seat.server);
                 }
@@ -150,24 +163,40 @@ impl<'a> Crew<'a> {
     }
 
     /// Asks who is there, unless that was asked within `interval`; waits a little for `count` of them.
-    async fn look(&mut self, interval: Duration, count: usize) -> Result<()> {
+    ///
+    /// A fleet may have servers of other simulators. Without any of the run's own, from the beginning on, they are an error.
+    async fn look(&mut self, job: &Job, interval: Duration, count: usize) -> Result<()> {
         if self.looked.is_some_and(|looked| looked.elapsed() < interval) {
             return Ok(());
         }
         let mut servers = self.network.servers(count, LOOK_WAIT).await;
-        servers.retain(|server| !self.avoided.contains(&server.server));
+        self.avoided.retain(|_, since| since.elapsed() < AVOIDED_FOR);
+        servers.retain(|server| !self.avoided.contains_key(&server.server));
         self.looked = Some(Instant::now());
-        for server in &servers {
-            let simulator = simulator(server);
-            let expected = self.simulator.get_or_insert_with(|| simulator.clone());
-            ensure!(
-                *expected == simulator,
-                "server {}: expected the run's simulator, {expected}, got {simulator}",
-                server.server
+        let first = servers.iter().find(|server| offered(server, job).is_some());
+        let Some(expected) = self.simulator.clone().or_else(|| first.map(simulator)) else {
+            self.servers = servers;
+            return Ok(());
+        };
+        let (ours, others): (Vec<_>, Vec<_>) =
+            servers.into_iter().partition(|server| simulator(server) == expected);
+        for other in others {
+            let ServerDescription { server, .. } = &other;
+            let words = format!(
+                "server {server}: expected the run's simulator, {expected}, got {}",
+                simulator(&other)
             );
+            if ours.is_empty() && !self.servers_seen {
+                bail!(words);
+            }
+            if self.strangers.insert(server.clone()) {
+                tracing::warn!("{words}; it is left out");
+            }
         }
-        self.servers_max = self.servers_max.max(servers.len());
-        self.servers = servers;
+        self.servers_seen |= !ours.is_empty();
+        self.simulator = Some(expected);
+        self.servers_max = self.servers_max.max(ours.len());
+        self.servers = ours;
         Ok(())
     }
 
@@ -214,10 +243,15 @@ impl<'a> Crew<'a> {
     }
 }
 
+/// What a server offers for a job.
+fn offered<'a>(server: &'a ServerDescription, job: &Job) -> Option<&'a TaskDescription> {
+    let (task, variant) = (&job.identity.task, &job.identity.variant);
+    server.tasks.iter().find(|one| one.task == *task && one.variant == *variant)
+}
+
 /// Why policies, which are made for Bridge's states and actions, cannot act in a server's task.
 fn unfit(server: &ServerDescription, job: &Job) -> Option<String> {
-    let (task, variant) = (&job.identity.task, &job.identity.variant);
-    let offered = server.tasks.iter().find(|one| one.task == *task && one.variant == *variant)?;
+    let (task, offered) = (&job.identity.task, offered(server, job)?);
     let got = (offered.state.len(), offered.action.len());
     (got != (STATE_LENGTH, ACTION_LENGTH)).then(|| {
         format!(
@@ -242,8 +276,6 @@ fn simulator(server: &ServerDescription) -> String {
 
 #[cfg(test)]
 mod tests {
-    use protocol::TaskDescription;
-
     use super::*;
 
     fn server(versions: &[u32]) -> ServerDescription {

@@ -71,7 +71,11 @@ impl Rollout<'_> {
         loop {
             self.fill(&mut attempts).await?;
             if attempts.is_empty() {
-                return Ok(());
+                // Resets may all have broken; what is to be run again waits in the queue.
+                if self.queue.is_empty() || *self.stop.borrow() != Stop::No {
+                    return Ok(());
+                }
+                continue;
             }
             let begun = Instant::now();
             let proposals = self.propose(&attempts)?;

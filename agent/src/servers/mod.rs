@@ -17,6 +17,8 @@ use crate::simulator::ServerProgram;
 const READY_TIMEOUT_SECS: u64 = 120;
 /// How often one server is started again. One that keeps dying has a cause that this cannot cure.
 const RESTARTS_MAX: u32 = 5;
+/// One that worked for so long did not die of that cause.
+const CURED_AFTER: Duration = Duration::from_secs(3600);
 
 /// What to start.
 #[derive(Debug, Clone)]
@@ -130,7 +132,10 @@ struct State {
 struct Slot {
     process: Option<ServerProcess>,
     server_id: Option<String>,
+    ready_at: Option<Instant>,
     restarts: u32,
+    /// Since it last worked for long.
+    restarts_in_a_row: u32,
 }
 
 /// What the watching thread owns.
@@ -195,6 +200,7 @@ impl Supervisor {
     fn on_line(&mut self, slot: usize, line: &str) {
         let Some(server_id) = line.strip_prefix("ready ") else { return };
         self.slots[slot].server_id = Some(server_id.trim().to_owned());
+        self.slots[slot].ready_at = Some(Instant::now());
         if self.slots.iter().all(|slot| slot.server_id.is_some())
             && let Some(ready) = self.ready.take()
         {
@@ -210,13 +216,19 @@ impl Supervisor {
         if self.ready.is_some() {
             bail!("a server did not start: {ended}");
         }
-        if self.slots[slot].restarts == RESTARTS_MAX {
+        let ready_at = self.slots[slot].ready_at.take();
+        if ready_at.is_some_and(|ready| ready.elapsed() > CURED_AFTER) {
+            self.slots[slot].restarts_in_a_row = 0;
+        }
+        if self.slots[slot].restarts_in_a_row == RESTARTS_MAX {
             let reason = format!("a server died {} times, at last: {ended}", RESTARTS_MAX + 1);
+            tracing::warn!("{reason}; it is not started again");
             lock(&self.state).given_up = Some(reason);
             return Ok(());
         }
         tracing::warn!("a server died and is started again: {ended}");
         self.slots[slot].restarts += 1;
+        self.slots[slot].restarts_in_a_row += 1;
         match self.spawn(slot) {
             Ok(process) => self.slots[slot].process = Some(process),
             Err(error) => lock(&self.state).given_up = Some(format!("{error:#}")),

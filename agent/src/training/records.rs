@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
-use protocol::Statistics;
+use protocol::{EpisodeOutcome, Statistics};
 
 use super::objection::object;
 use super::{LabelledEpisode, decision};
@@ -59,22 +59,36 @@ pub fn from_labels(
         let reason = match (object(&label.outcome, reader.policy), label.record) {
             (Some(objection), _) => objection.reason(),
             (None, None) => "record on another machine",
-            (None, Some(path)) => {
-                let record = EpisodeRecord::read(&path)?;
-                let same = outcome(&record) == label.outcome;
-                ensure!(
-                    same,
-                    "record {}: expected the episode of its label, got another",
-                    path.display()
-                );
-                let episode = labelled(&record, reader);
-                episodes.push(episode.with_context(|| format!("record {}", path.display()))?);
-                continue;
-            }
+            (None, Some(path)) => match of_label(&path, &label.outcome)? {
+                Ok(record) => {
+                    let episode = labelled(&record, reader);
+                    let episode = episode.with_context(|| format!("record {}", path.display()));
+                    episodes.push(episode?);
+                    continue;
+                }
+                Err(reason) => reason,
+            },
         };
         *set_aside.entry(reason).or_insert(0) += 1;
     }
     Ok((episodes, set_aside))
+}
+
+/// The record of a label, or why it is no longer there: a run's folder may be removed, and made again.
+fn of_label(
+    path: &Path,
+    label: &EpisodeOutcome,
+) -> anyhow::Result<Result<EpisodeRecord, &'static str>> {
+    if !path.exists() {
+        return Ok(Err("record is gone"));
+    }
+    let record = EpisodeRecord::read(path)?;
+    if record.identity.run != label.run {
+        return Ok(Err("record of another run"));
+    }
+    let name = path.display();
+    ensure!(outcome(&record) == *label, "record {name}: expected its label's episode, got another");
+    Ok(Ok(record))
 }
 
 /// The record as training samples; refuses what must not teach.
@@ -89,6 +103,12 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
     let (mut statistics, mut memory) = (Statistics::default(), Memory::default());
     for (index, step) in record.steps.iter().enumerate() {
         let before = std::mem::replace(&mut statistics, step.statistics);
+        // What was said in a step is remembered, as when it was scored, whether or not one of it was executed.
+        let sample = match &decisions {
+            Some(_) => decision::read(step, before, &mut memory, reader)
+                .with_context(|| format!("step {index}"))?,
+            None => None,
+        };
         // The robot held still: nothing that the policy said was executed.
         let Some(chosen) = step.chosen else { continue };
         let candidate = step.candidates.get(chosen as usize);
@@ -99,8 +119,7 @@ pub fn labelled(record: &EpisodeRecord, reader: Reader<'_>) -> anyhow::Result<La
         hidden.extend(hidden_from_bytes(bytes).with_context(|| format!("step {index}"))?);
         steps.push(index);
         if let Some(list) = &mut decisions {
-            let sample = decision::read(step, before, &mut memory, reader);
-            match sample.with_context(|| format!("step {index}"))? {
+            match sample {
                 Some(sample) if chosen == 0 => list.push(sample),
                 _ => decisions = None,
             }
@@ -307,6 +326,16 @@ mod tests {
             ("seed outside of the collection range", 1),
         ];
         assert_eq!(set_aside, BTreeMap::from(expected));
+
+        // Removed, and made again with the same options.
+        records[0].identity.run = "again".to_owned();
+        write(folder.path(), &records[..1]);
+        let set_aside = from_labels(&path, CAFE).expect("a whole store").1;
+        assert_eq!(set_aside["record of another run"], 1);
+        std::fs::remove_file(record_path(folder.path(), &records[0].identity.id()))
+            .expect("it is there");
+        let set_aside = from_labels(&path, CAFE).expect("a whole store").1;
+        assert_eq!(set_aside["record is gone"], 1);
         let missing = from_labels(&folder.path().join("none.sqlite"), CAFE).expect_err("no store");
         assert!(
             missing.to_string().ends_with("none.sqlite: expected a file, got none"),
