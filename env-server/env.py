@@ -43,7 +43,9 @@ class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         self, *, seed: int | None = None, options: Fields | None = None
     ) -> tuple[Fields, Fields]:
         super().reset(seed=seed)
-        observation, info = self._inner.reset(seed=seed, options=options)
+        # LeRobot has options of its own.
+        ours = {name: value for name, value in (options or {}).items() if name == "configuration"}
+        observation, info = self._inner.reset(seed=seed, options=ours)
         return _fields(observation), {**info, "is_success": False}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Fields, float, bool, bool, Fields]:

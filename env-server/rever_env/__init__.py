@@ -6,6 +6,8 @@ world, robosuite_world, gymnasium_world -> worlds -> session -> server
 server -> remote_session -> remote: the same as Gymnasium environments, in another process
 """
 
+import os
+import sys
 from typing import TYPE_CHECKING
 
 from rever_env import registration
@@ -15,6 +17,13 @@ if TYPE_CHECKING:
 
 __all__ = ["RemoteEnv", "RemoteVectorEnv"]
 
+# MuJoCo reads its OpenGL backend from the environment when it is first imported.
+if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
+# Mesa's software renderer draws in the thread that asks: handing a small picture to threads of its
+# own takes as long as drawing it, servers share a machine by processes, and threads do not live on
+# in a process that is forked, as Gymnasium's asynchronous vectors are.
+os.environ.setdefault("LP_NUM_THREADS", "0")
 registration.register()
 
 

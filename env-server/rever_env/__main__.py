@@ -10,11 +10,7 @@ from rever_env import health, serving
 
 def main() -> int:
     """Parses, calls one library function, prints one error, returns the exit status."""
-    # MuJoCo reads its OpenGL backend from the environment when it is first imported.
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    # Mesa's software renderer draws in the thread that asks: handing a small picture to threads of
-    # its own takes as long as drawing it, and servers share a machine by processes.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
+    os.environ.setdefault("MUJOCO_GL", "egl")  # whatever screen there is
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # Gymnasium's own pictures need no screen
     arguments = _parser().parse_args()
     from rever_env.fault import Fault

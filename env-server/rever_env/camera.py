@@ -1,5 +1,6 @@
 """The camera: RGB images and visible-pixel masks from an offscreen OpenGL context."""
 
+import os
 import weakref
 from types import TracebackType
 from typing import Any
@@ -40,7 +41,8 @@ class Camera:
         except Exception as error:  # the binding raises whatever its backend raises
             raise RendererUnavailable(
                 f"renderer for {height} x {width} images: expected an offscreen OpenGL context, "
-                f"got {type(error).__name__}: {error}"
+                f"got {type(error).__name__}: {error} (MUJOCO_GL, which is read when mujoco is "
+                f"first imported, is {os.environ.get('MUJOCO_GL')!r})"
             ) from error
         # Freed at the latest before the interpreter ends, while the display still exists.
         self._release = weakref.finalize(self, _release, self._context, self._renderer)

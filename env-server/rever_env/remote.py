@@ -132,13 +132,19 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
 
     def send_step(self, action: NDArray[np.float32]) -> None:
         """The first half of step."""
+        numbers = self.checked(action)
+        self.session.send(lambda sequence: protocol.Step(sequence, numbers))
+
+    def checked(self, action: NDArray[np.float32]) -> tuple[float, ...]:
+        """The action's numbers; ValueError for others than the space has."""
         numbers = np.asarray(action, np.float32)
         if numbers.shape != self.action_space.shape:
             raise ValueError(
                 f"action: expected shape {self.action_space.shape}, got {numbers.shape}"
             )
-        numbers = numbers.reshape(-1)
-        self.session.send(lambda sequence: protocol.Step(sequence, tuple(numbers.tolist())))
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"action: expected finite numbers, got {numbers.tolist()}")
+        return tuple(numbers.reshape(-1).tolist())
 
     def receive_step(self) -> Stepped:
         """The second half."""
@@ -240,6 +246,9 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
             ended = np.flatnonzero(self._ended).tolist()
             raise ValueError(f"environments {ended} have ended: expected reset with a reset_mask")
         begins = self._ended.copy()
+        for env, action, begin in zip(self.envs, actions, begins, strict=True):
+            if not begin:
+                env.checked(action)  # before any of them moves
         for env, action, begin in zip(self.envs, actions, begins, strict=True):
             if begin:
                 env.send_reset(None)

@@ -59,6 +59,7 @@ class RemoteSession:
         self._replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._sequence = 0
         self._request = b""
+        self._is_unanswered = False
         self._last_image = protocol.Image(0, 0, b"")  # what a step's tiles are laid on
         self._asked_at = 0.0
         self._end = ""  # why the server ended the session
@@ -78,8 +79,16 @@ class RemoteSession:
         """Sends the next request; make: its number to the request."""
         if self._end:
             raise RemoteRefused(self._end)  # nobody would answer
-        self._request = protocol.REQUEST.encode(make(self._sequence + 1))
+        request = make(self._sequence + 1)
+        # What the lost reply brought is missing: a reward, and the picture that tiles are laid on.
+        if self._is_unanswered and not isinstance(request, protocol.Reset | protocol.Close):
+            raise RemoteFault(
+                f"server {self.server}: expected Reset after a request whose reply was not taken, "
+                f"got {type(request).__name__}"
+            )
+        self._request = protocol.REQUEST.encode(request)
         self._sequence += 1
+        self._is_unanswered = True
         self._asked_at = time.monotonic()
         self._publisher.put(self._request)
 
@@ -96,12 +105,16 @@ class RemoteSession:
             self._publisher.put(self._request)
             wait = min(2.0 * wait, _RESEND_SECS_MAX)
         if isinstance(reply, protocol.Refused):
+            self._is_unanswered = False
             if reply.sequence == 0:  # every request of ours can be read: it is the session's end
                 self._end = reply.reason
             raise RemoteRefused(reply.reason)
         if isinstance(reply, protocol.Faulted):
+            self._is_unanswered = False
             raise RemoteFault(f"server {self.server}: {reply.kind.value}: {reply.reason}")
-        return self._whole(reply)
+        whole = self._whole(reply)
+        self._is_unanswered = False
+        return whole
 
     def close(self) -> None:
         """Ends the session; a server that is gone has ended it already."""

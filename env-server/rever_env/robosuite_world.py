@@ -298,6 +298,8 @@ class RobosuiteWorld:
         return action
 
     def close(self) -> None:
+        # Else robosuite frees its buffers in whatever context is current: another world's pictures.
+        self._make_current()
         self._environment.close()
 
     def _make_current(self) -> None:

@@ -123,11 +123,27 @@ class Session:
         self._worlds.task(request.task, request.variant)
         key = self._key_of(request.task, request.variant)
         if self._world is None or key != self._key:
-            self._release()
-            self._world, self._key = self._worlds.take(key), key
-        observation = self._world.reset(configuration=request.configuration, seed=request.seed)
+            observation = self._change(key, request)
+        else:
+            observation = self._world.reset(configuration=request.configuration, seed=request.seed)
         self._slots.clear()
         self._running = True
+        return observation
+
+    def _change(self, key: Key, request: protocol.Reset) -> world.Observation:
+        """Resets another world and takes it in place of this one, which a refusal leaves alone."""
+        fresh = self._worlds.take(key)
+        try:
+            observation = fresh.reset(configuration=request.configuration, seed=request.seed)
+        except (world.InvalidAction, world.InvalidPlacement):
+            self._worlds.give_back(key, fresh)
+            raise
+        except Exception:
+            self._release()
+            self._world, self._key = fresh, key  # to be closed with the fault
+            raise
+        self._release()
+        self._world, self._key = fresh, key
         return observation
 
     def _fault(self, sequence: int, kind: protocol.FaultKind, reason: str) -> bytes:

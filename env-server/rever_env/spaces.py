@@ -1,5 +1,6 @@
 """Gymnasium's spaces and the protocol's dimensions: one of them made from the other."""
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -59,7 +60,19 @@ def configuration_of(options: dict[str, Any] | None) -> int | None:
     unknown = set(options) - {"configuration"}
     if unknown:
         raise ValueError(f"reset options: expected only 'configuration', got {sorted(unknown)}")
-    return options.get("configuration")
+    configuration = options.get("configuration")
+    if configuration is None:
+        return None
+    try:
+        number = operator.index(configuration)
+    except TypeError:
+        number = -1
+    if isinstance(configuration, bool) or not 0 <= number < 1 << 32:
+        raise ValueError(
+            "reset options: configuration: expected a whole number from 0 to 4294967295, "
+            f"got {configuration!r}"
+        )
+    return number
 
 
 def check_render_mode(render_mode: str | None) -> None:

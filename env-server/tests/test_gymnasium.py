@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import fields
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -50,3 +51,15 @@ def test_unknown_options_are_refused(task: Task) -> None:
     with pytest.raises(ValueError, match="expected only 'configuration'"):
         environment.reset(options={"configuraton": 4})
     environment.close()
+
+
+def test_asynchronous_vectors_draw_in_their_own_processes() -> None:
+    vector: Any = gymnasium.make_vec(
+        "rever_env:rever/SpoonOnTowel-v1", num_envs=2, vectorization_mode="async"
+    )
+    try:
+        vector.reset_async(seed=3)
+        observation, _ = vector.reset_wait(timeout=60.0)
+        assert observation["image"].shape[0] == 2 and observation["image"].any()
+    finally:
+        vector.close(terminate=True)

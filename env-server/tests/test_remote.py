@@ -198,6 +198,14 @@ def test_what_is_wrong_is_said(endpoint: str) -> None:
         remote.step(np.zeros(6, np.float32))
     with pytest.raises(ValueError, match="expected only 'configuration'"):
         remote.reset(options={"configuraton": 4})
+    for configuration in (-1, 3.0, True, 1 << 32):
+        with pytest.raises(ValueError, match="expected a whole number from 0 to 4294967295, got"):
+            remote.reset(options={"configuration": configuration})
+    with pytest.raises(RemoteRefused, match="configuration 999: expected"):
+        remote.reset(options={"configuration": 999})
+    remote.reset(seed=0, options={"configuration": np.int64(3)})
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        remote.step(np.full(7, np.nan, np.float32))
     remote.close()
 
 
@@ -221,6 +229,33 @@ def test_a_reply_that_cannot_be_understood_is_a_fault_and_no_reward(endpoint: st
         remote.reset(seed=0)
     remote.step(STILL)
     remote.close()
+
+
+def test_no_step_follows_one_whose_reply_was_not_taken(endpoint: str) -> None:
+    remote = rever_env.RemoteEnv(endpoint, image_height=16, image_width=16)
+    first, _ = remote.reset(seed=0)
+    remote.send_step(STILL)  # and interrupted, by a user for instance
+    with pytest.raises(RemoteFault, match="expected Reset after a request whose reply was not"):
+        remote.step(STILL)
+    assert np.array_equal(remote.reset(seed=0)[0]["image"], first["image"])
+    remote.step(STILL)
+    remote.close()
+
+
+def test_a_wrong_action_moves_no_environment_of_a_vector(endpoint: str) -> None:
+    environments = vector(endpoint, AutoresetMode.DISABLED)
+    seeds: Any = [5, 6]
+    environments.reset(seed=seeds)
+    actions = np.tile(STILL, (2, 1))
+    actions[1, 0] = np.nan
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        environments.step(actions)
+    observation, *_ = run(environments, 1)
+    alone = rever_env.RemoteEnv(endpoint, image_height=8, image_width=8)
+    alone.reset(seed=5)
+    assert np.array_equal(observation["state"][0], alone.step(STILL)[0]["state"])
+    alone.close()
+    environments.close()
 
 
 def test_a_killed_server_is_a_fault_and_no_reward() -> None:

@@ -1,5 +1,6 @@
 """robosuite's environments behind the protocol, where robosuite is installed."""
 
+import gc
 from collections.abc import Iterator
 
 import numpy as np
@@ -102,6 +103,20 @@ def test_physics_that_started_anew_is_a_fault(worlds: list[RobosuiteWorld]) -> N
     with pytest.raises(InvalidAction, match="before reset"):
         world.step(MOVE)
     assert all(same(*pair) for pair in zip(expected, run(world, 2), strict=True))
+
+
+def test_a_world_that_is_closed_takes_no_other_worlds_pictures(
+    worlds: list[RobosuiteWorld],
+) -> None:
+    first = worlds[0]
+    expected = run(first, 4)
+    other = RobosuiteWorld(offered(["Stack"], ["Panda"], 6, 20.0)["Stack/Panda"], 24, 40)
+    other.reset(configuration=None, seed=0)
+    first.reset(configuration=None, seed=4)
+    other.close()
+    del other
+    gc.collect()
+    assert all(same(*pair) for pair in zip(expected, run(first, 4), strict=True))
 
 
 def test_two_arms_take_robosuites_own_actions() -> None:

@@ -125,6 +125,20 @@ def test_slots_last_until_the_next_reset(session: Session) -> None:
     check_refused(ask(session, protocol.Restore(9, 1)), 9, "slot: expected one of [], got 1")
 
 
+def test_a_refused_reset_of_another_task_changes_nothing(session: Session, worlds: Worlds) -> None:
+    other = Session(OPEN, worlds)
+    ask(other, protocol.Reset(1, CUBE, "default", 3, 7))
+    other.end()  # its world waits in the middle of an episode
+    ask(session, protocol.Save(3, 1))
+    stepped = ask(session, protocol.Step(4, STILL))
+    ask(session, protocol.Restore(5, 1))
+    check_refused(ask(session, protocol.Reset(6, CUBE, "default", 999, 7)), 6, "configuration")
+    again = ask(session, protocol.Step(7, STILL))
+    assert isinstance(stepped, protocol.Stepped) and isinstance(again, protocol.Stepped)
+    assert stepped.transition == again.transition
+    assert isinstance(ask(session, protocol.Restore(8, 1)), protocol.Restored)
+
+
 def test_a_step_brings_the_tiles_that_changed_or_all_of_them(worlds: Worlds) -> None:
     brought = []
     for whole_images in (False, True):

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use anyhow::{Result, bail, ensure};
-use protocol::{Open, Reply, Request, Transition, decode};
+use protocol::{Open, Reply, Request, TaskDescription, Transition, decode};
 
 use super::subject::{Subject, Talk, names};
 use super::{Table, Tested};
@@ -121,6 +121,18 @@ async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
     names(&talk.refused(request).await?, &["configuration", &beyond.to_string()])?;
     // Refused: the world is unchanged, and the episode goes on.
     talk.hold_still().await?;
+    talk.save(0).await?;
+    let expected = stepped(talk.go().await?);
+    talk.restore(0).await?;
+    let mut others = subject.description.tasks.iter();
+    if let Some(other) = others.find(|other| other.task != subject.task().task) {
+        let TaskDescription { task, variant, configurations, .. } = other.clone();
+        let configuration = Some(configurations);
+        let reset = |sequence| Request::Reset { sequence, task, variant, configuration, seed: 0 };
+        names(&talk.refused(reset).await?, &["configuration"])?;
+        equal(&[expected], &[stepped(talk.go().await?)])?;
+        talk.restore(0).await?;
+    }
     talk.close().await?;
     Ok(Tested::Kept)
 }

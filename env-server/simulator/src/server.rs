@@ -103,7 +103,7 @@ impl<'a> Server<'a> {
         );
         let keys = Keys::new(&options.fleet)?;
         let (enqueue, work) = sync_channel((sessions_max as usize + 1) * PENDING_PER_SESSION_MAX);
-        Ok(Server {
+        let server = Server {
             id: fresh_id(),
             network,
             worlds,
@@ -113,7 +113,10 @@ impl<'a> Server<'a> {
             ended_steps: 0,
             work,
             enqueue,
-        })
+        };
+        // What cannot be described is refused now.
+        encode(&server.description())?;
+        Ok(server)
     }
 
     /// Declares everything, the liveliness token last; then works until `stop` is set.

@@ -105,8 +105,9 @@ impl Session {
         }
         let request = match request {
             Request::Reset { sequence, task, variant, configuration, seed } => {
-                let world = self.world_of(&task, &variant, worlds)?;
-                let observation = world.reset(configuration, seed)?;
+                worlds.task(&task, &variant)?;
+                let key = key(&self.opened, &task, &variant);
+                let observation = self.reset(key, configuration, seed, worlds)?;
                 self.slots.clear();
                 self.is_running = true;
                 self.last_image = Some(observation.image.clone());
@@ -157,23 +158,26 @@ impl Session {
         }
     }
 
-    fn world_of(
+    /// Resets this world, or another one and takes it instead; a refusal leaves this one alone.
+    fn reset(
         &mut self,
-        task: &str,
-        variant: &str,
+        key: Key,
+        configuration: Option<u32>,
+        seed: u64,
         worlds: &mut Worlds,
-    ) -> Result<&mut World, Fault> {
-        worlds.task(task, variant)?;
-        let key = key(&self.opened, task, variant);
-        if self.world.as_ref().is_none_or(|(current, _)| *current != key) {
-            self.release(worlds);
-            let world = worlds.take(&key)?;
-            return Ok(&mut self.world.insert((key, world)).1);
+    ) -> Result<Observation, Fault> {
+        if let Some((_, world)) = self.world.as_mut().filter(|(current, _)| *current == key) {
+            return world.reset(configuration, seed);
         }
-        match &mut self.world {
-            Some((_, world)) => Ok(world),
-            None => unreachable!("a session without a world has just taken one"),
+        let mut world = worlds.take(&key)?;
+        let observation = world.reset(configuration, seed);
+        if observation.as_ref().is_err_and(|fault| fault.kind().is_none()) {
+            worlds.give_back(key, world);
+            return observation;
         }
+        self.release(worlds);
+        self.world = Some((key, world)); // after a fault to be dropped with it
+        observation
     }
 
     /// The world may be broken for good: the next Reset gets another one.
