@@ -23,7 +23,11 @@ _OPEN_SECS = 60.0  # a server may have to make a world first
 
 
 class RemoteFault(RuntimeError):
-    """The world or the way to it broke: the episode has no outcome. The next reset may work."""
+    """The world or the way to it broke: the episode has no outcome.
+
+    The next reset may work. Where the session itself is gone, with its server or for its long
+    silence, it will not, and the environment has to be made again.
+    """
 
 
 class RemoteRefused(ValueError):
