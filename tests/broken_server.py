@@ -71,6 +71,14 @@ def breaks_first_reset() -> None:
         return original(self, request)
 
 
+def changes_world_first() -> None:
+    @wrap(Session, "_change")
+    def change(_original: Any, self: Any, key: Any, request: protocol.Reset) -> Any:
+        self._release()
+        self._world, self._key = self._worlds.take(key), key
+        return self._world.reset(configuration=request.configuration, seed=request.seed)
+
+
 def one_seed() -> None:
     @wrap(Session, "_reset")
     def reset(original: Any, self: Any, request: protocol.Reset) -> Any:
@@ -193,6 +201,7 @@ DEFECTS = {
         overstates_time,
         any_length,
         breaks_first_reset,
+        changes_world_first,
     )
 }
 

@@ -39,7 +39,7 @@ const BROKEN: [(&str, &[&str]); 7] = [
         "one_seed,no_limit,overstates_time,forgets_tile",
         &["seeds", "sessions_max", "simulator_time", "save"],
     ),
-    ("forgets_close,any_length", &["sessions_max", "dimensions"]),
+    ("forgets_close,any_length,changes_world_first", &["sessions_max", "dimensions", "reset_task"]),
     ("keeps_leases", &["holder_gone", "holder_missing", "idle"]),
 ];
 

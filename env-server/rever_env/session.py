@@ -1,5 +1,6 @@
 """One leased session: its numbered requests, its world, its saved states."""
 
+import dataclasses
 import logging
 import time
 from typing import Any
@@ -179,8 +180,9 @@ class Session:
             sequence, observation, pixels, judged, changed_tiles, simulator_us
         )
         if data is None:
-            whole = self._observation(transition.observation, bytes(pixels))
-            stepped = protocol.Transition(whole, *judged)
+            seen = dataclasses.replace(observation.image, pixels=bytes(pixels))
+            observation = dataclasses.replace(observation, image=seen)
+            stepped = protocol.Transition(observation, *judged)
             message = protocol.Stepped(sequence, stepped, changed_tiles, simulator_us)
             data = protocol.REPLY.encode(message)
         return data
