@@ -44,7 +44,7 @@ class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
     ) -> tuple[Fields, Fields]:
         super().reset(seed=seed)
         # LeRobot has options of its own.
-        ours = {name: value for name, value in (options or {}).items() if name == "configuration"}
+        ours = {name: value for name, value in (options or {}).items() if name == "layout"}
         observation, info = self._inner.reset(seed=seed, options=ours)
         return _fields(observation), {**info, "is_success": False}
 

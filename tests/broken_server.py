@@ -76,7 +76,7 @@ def changes_world_first() -> None:
     def change(_original: Any, self: Any, key: Any, request: protocol.Reset) -> Any:
         self._release()
         self._world, self._key = self._worlds.take(key), key
-        return self._world.reset(configuration=request.configuration, seed=request.seed)
+        return self._world.reset(layout=request.layout, seed=request.seed)
 
 
 def one_seed() -> None:
@@ -122,7 +122,7 @@ def steps_unreset() -> None:
     @wrap(Session, "__init__")
     def init(original: Any, self: Any, *given: Any, **named: Any) -> None:
         original(self, *given, **named)
-        self._world.reset(configuration=None, seed=0)
+        self._world.reset(layout=None, seed=0)
         self._running = True
 
 

@@ -96,7 +96,7 @@ fn wild_actions_are_equal_bit_for_bit() {
         assert_equal_traces(&[
             "--task",
             task,
-            "--configuration",
+            "--layout",
             "7",
             "--side",
             "224",

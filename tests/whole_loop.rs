@@ -20,7 +20,7 @@ const ARGUMENTS: [&str; 6] = [
     "--strategies=sample,verifier",
     "--candidates=3",
     "--episodes=1",
-    "--placements=random",
+    "--layouts=random",
     "--seed=7",
     "--sessions=8",
 ];
@@ -228,7 +228,7 @@ fn a_reset_that_breaks_is_repeated_and_another_simulator_is_left_out() {
         &format!("--connect={endpoint}"),
         "--tasks=widowx_spoon_on_towel",
         "--strategies=sample",
-        "--placements=random",
+        "--layouts=random",
         "--seed=7",
         "--episodes=2",
         // Nothing else goes on while the reset breaks.

@@ -32,8 +32,8 @@ fn open() -> Open {
     }
 }
 
-fn reset(task: &str, configuration: Option<u32>) -> Reset {
-    Reset { task: task.into(), variant: "default".into(), configuration, seed: 2_000_000_007 }
+fn reset(task: &str, layout: Option<u32>) -> Reset {
+    Reset { task: task.into(), variant: "default".into(), layout, seed: 2_000_000_007 }
 }
 
 fn spoon() -> Reset {
@@ -352,7 +352,7 @@ fn outcome(run: &str, episode: u32) -> EpisodeOutcome {
         run: run.into(),
         task: "widowx_spoon_on_towel".into(),
         variant: "default".into(),
-        configuration: None,
+        layout: None,
         seed: 1_000_000_000 + u64::from(episode),
         episode,
         strategy: "sample".into(),

@@ -132,11 +132,11 @@ impl Campaign {
 
     /// Everything that decides the results, by name. Where it runs and how many episodes at once does not.
     fn options(&self) -> Value {
-        let Suite { tasks, episodes, placements, range, seed } = &self.suite;
+        let Suite { tasks, episodes, layouts, range, seed } = &self.suite;
         json!({
             "tasks": tasks,
             "episodes": episodes,
-            "placements": placements,
+            "layouts": layouts,
             "seeds_from": range.first(),
             "seed": seed,
             "arms": self.arms.iter().map(Arm::to_string).collect::<Vec<_>>(),

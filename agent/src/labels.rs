@@ -1,6 +1,6 @@
 //! The label store: one row per finished episode of any run, fed by the outcomes that agents publish.
 //!
-//! A row names the record that it comes of and everything that decides whether it may teach: placement, seed, strategy,
+//! A row names the record that it comes of and everything that decides whether it may teach: layout, seed, strategy,
 //! temperature, policy. The same outcome may come any number of times; it is one row.
 
 use std::path::{Path, PathBuf};
@@ -58,7 +58,7 @@ pub fn outcome(record: &EpisodeRecord) -> EpisodeOutcome {
         run: identity.run.clone(),
         task: identity.task.clone(),
         variant: identity.variant.clone(),
-        configuration: identity.configuration,
+        layout: identity.layout,
         seed: identity.seed,
         episode: identity.episode,
         strategy: identity.strategy.clone(),
@@ -79,7 +79,7 @@ pub fn episode_id(outcome: &EpisodeOutcome) -> String {
         run: outcome.run.clone(),
         task: outcome.task.clone(),
         variant: outcome.variant.clone(),
-        configuration: outcome.configuration,
+        layout: outcome.layout,
         episode: outcome.episode,
         seed: outcome.seed,
         // Not part of the name.
@@ -123,7 +123,7 @@ impl LabelStore {
             "INSERT INTO labels VALUES (?1,?2,?3,?4,?5,?6,?7,?8,?9,?10,?11,?12,?13,?14,?15,?16,?17,?18,?19,?20,?21,?22,?23,?24,?25)
              ON CONFLICT (run, id) DO NOTHING",
             params![
-                outcome.run, label.id, outcome.task, outcome.variant, outcome.configuration, outcome.seed as i64,
+                outcome.run, label.id, outcome.task, outcome.variant, outcome.layout, outcome.seed as i64,
                 outcome.episode, outcome.strategy, outcome.candidates, outcome.temperature, outcome.policy,
                 outcome.verifier, statistics.is_success, statistics.is_grasped, statistics.ever_grasped,
                 statistics.consecutive_grasp, statistics.moved_correct_object, statistics.moved_wrong_object,
@@ -161,7 +161,7 @@ impl LabelStore {
 const SCHEMA: &str = "
     PRAGMA journal_mode = WAL;
     CREATE TABLE IF NOT EXISTS labels (
-        run TEXT NOT NULL, id TEXT NOT NULL, task TEXT NOT NULL, variant TEXT NOT NULL, configuration INTEGER,
+        run TEXT NOT NULL, id TEXT NOT NULL, task TEXT NOT NULL, variant TEXT NOT NULL, layout INTEGER,
         seed INTEGER NOT NULL, episode INTEGER NOT NULL, strategy TEXT NOT NULL, candidates INTEGER NOT NULL,
         temperature REAL NOT NULL, policy TEXT NOT NULL, verifier TEXT,
         is_success INTEGER NOT NULL, is_grasped INTEGER NOT NULL, ever_grasped INTEGER NOT NULL,
@@ -176,7 +176,7 @@ fn read(row: &Row<'_>) -> rusqlite::Result<Label> {
         run: row.get("run")?,
         task: row.get("task")?,
         variant: row.get("variant")?,
-        configuration: row.get("configuration")?,
+        layout: row.get("layout")?,
         seed: row.get::<_, i64>("seed")? as u64,
         episode: row.get("episode")?,
         strategy: row.get("strategy")?,
@@ -212,7 +212,7 @@ mod tests {
             run: "run-1".into(),
             task: "widowx_stack_cube".into(),
             variant: "default".into(),
-            configuration: None,
+            layout: None,
             seed,
             episode: 3,
             strategy: "verifier+medoid".into(),

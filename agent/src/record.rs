@@ -49,8 +49,8 @@ pub struct EpisodeIdentity {
     pub task: String,
     /// The task's variant.
     pub variant: String,
-    /// One of the 24 placements, or none for a random one drawn from `seed`.
-    pub configuration: Option<u32>,
+    /// One of the 24 layouts, or none for a random one drawn from `seed`.
+    pub layout: Option<u32>,
     /// Number within task and variant; equal numbers of one run are paired.
     pub episode: u32,
     /// The world's seed.
@@ -249,7 +249,7 @@ pub(crate) mod tests {
                 run: "made-up".into(),
                 task: "widowx_stack_cube".into(),
                 variant: "default".into(),
-                configuration: None,
+                layout: None,
                 episode,
                 seed: 3_000_000_001,
                 sampling_seed: 9_007_199_254_740_991,

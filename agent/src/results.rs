@@ -265,7 +265,7 @@ mod tests {
             run: "run".into(),
             task: task.into(),
             variant: "default".into(),
-            configuration: None,
+            layout: None,
             episode,
             seed: 3_000_000_000,
             sampling_seed: 1,

@@ -32,7 +32,7 @@ const RENDER_ONE_FRAME: &str = "
 from rever_env import tasks
 from rever_env.world import World
 world = World(next(iter(tasks.load().values())))
-image = world.reset(configuration=0, seed=0).image
+image = world.reset(layout=0, seed=0).image
 world.close()
 assert image.max() > image.min(), 'the rendered frame has one colour only'
 ";

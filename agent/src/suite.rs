@@ -23,8 +23,8 @@ pub const TASKS: [&str; 4] = [
 /// The variant that a task has unless another is asked for.
 pub const VARIANT_DEFAULT: &str = "default";
 
-/// SIMPLER's placements of each task.
-pub const CONFIGURATIONS: u32 = 24;
+/// SIMPLER's layouts of each task.
+pub const LAYOUTS: u32 = 24;
 
 /// Seeds of one range; no two ranges share a seed.
 const SEEDS_PER_RANGE: u64 = 1_000_000_000;
@@ -57,8 +57,8 @@ impl SeedRange {
 /// Where the objects of each episode stand.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Placements {
-    /// The 24 configurations, over and over.
+pub enum Layouts {
+    /// The 24 layouts, over and over.
     Grid,
     /// Drawn from each episode's seed.
     Random,
@@ -72,10 +72,10 @@ pub struct Suite {
     /// Episodes of each task.
     pub episodes: u32,
     /// Where objects stand.
-    pub placements: Placements,
+    pub layouts: Layouts,
     /// Where seeds come from.
     pub range: SeedRange,
-    /// Another number gives other placements and other samples.
+    /// Another number gives other layouts and other samples.
     pub seed: u64,
 }
 
@@ -93,8 +93,8 @@ impl Suite {
         EpisodePlan {
             task: task.to_owned(),
             variant: VARIANT_DEFAULT.to_owned(),
-            configuration: (self.placements == Placements::Grid)
-                .then_some(episode % CONFIGURATIONS),
+            layout: (self.layouts == Layouts::Grid)
+                .then_some(episode % LAYOUTS),
             episode,
             seed: self.range.first() + place % SEEDS_PER_RANGE,
             // Every reader of a record, JavaScript included, must hold this number exactly.
@@ -110,8 +110,8 @@ pub struct EpisodePlan {
     pub task: String,
     /// The task's variant.
     pub variant: String,
-    /// One of the 24 placements, or none for a random one.
-    pub configuration: Option<u32>,
+    /// One of the 24 layouts, or none for a random one.
+    pub layout: Option<u32>,
     /// Number within the task.
     pub episode: u32,
     /// The world's seed.
@@ -195,15 +195,15 @@ fn first_eight_bytes(hash: Sha256) -> u64 {
 mod tests {
     use super::*;
 
-    fn suite(placements: Placements, seed: u64) -> Suite {
+    fn suite(layouts: Layouts, seed: u64) -> Suite {
         let tasks = TASKS.map(str::to_owned).to_vec();
-        Suite { tasks, episodes: 30, placements, range: SeedRange::Evaluation, seed }
+        Suite { tasks, episodes: 30, layouts, range: SeedRange::Evaluation, seed }
     }
 
     #[test]
     fn an_episode_is_the_same_in_every_suite_that_has_it() {
-        let all = suite(Placements::Random, 5).episodes();
-        let mut few = suite(Placements::Random, 5);
+        let all = suite(Layouts::Random, 5).episodes();
+        let mut few = suite(Layouts::Random, 5);
         few.tasks = vec![TASKS[2].to_owned()];
         few.episodes = 7;
         for plan in few.episodes() {
@@ -213,8 +213,8 @@ mod tests {
 
     #[test]
     fn seeds_differ_and_stay_in_their_range() {
-        let mut plans = suite(Placements::Random, 0).episodes();
-        plans.extend(suite(Placements::Random, 1).episodes());
+        let mut plans = suite(Layouts::Random, 0).episodes();
+        plans.extend(suite(Layouts::Random, 1).episodes());
         assert!(plans.iter().all(|plan| SeedRange::Evaluation.contains(plan.seed)));
         assert!(plans.iter().all(|plan| !SeedRange::Collection.contains(plan.seed)));
         assert!(plans.iter().all(|plan| plan.sampling_seed < 1 << 53));
@@ -226,7 +226,7 @@ mod tests {
 
     #[test]
     fn seeds_never_change_between_versions() {
-        let plan = &suite(Placements::Random, 0).episodes()[0];
+        let plan = &suite(Layouts::Random, 0).episodes()[0];
         assert_eq!((plan.seed, plan.sampling_seed), SEEDS_OF_THE_FIRST_EPISODE);
         assert_ne!(step_seed(1, 0), step_seed(1, 1));
         assert_ne!(step_seed(1, 0), step_seed(2, 0));
@@ -237,12 +237,12 @@ mod tests {
     const SEEDS_OF_THE_FIRST_EPISODE: (u64, u64) = (3_977_631_995, 8_353_930_603_780_422);
 
     #[test]
-    fn the_grid_has_every_configuration_once_before_any_comes_again() {
-        let plans = suite(Placements::Grid, 0).episodes();
+    fn the_grid_has_every_layout_once_before_any_comes_again() {
+        let plans = suite(Layouts::Grid, 0).episodes();
         let of_task = plans.iter().filter(|plan| plan.task == TASKS[1]);
-        let configurations: Vec<Option<u32>> = of_task.map(|plan| plan.configuration).collect();
-        assert_eq!(configurations[..24], (0..24).map(Some).collect::<Vec<_>>());
-        assert_eq!(configurations[24..], (0..6).map(Some).collect::<Vec<_>>());
+        let layouts: Vec<Option<u32>> = of_task.map(|plan| plan.layout).collect();
+        assert_eq!(layouts[..24], (0..24).map(Some).collect::<Vec<_>>());
+        assert_eq!(layouts[24..], (0..6).map(Some).collect::<Vec<_>>());
     }
 
     #[test]

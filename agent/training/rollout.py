@@ -1,6 +1,6 @@
 """Measures a checkpoint in the world, batched over episodes in lockstep, without any server.
 
-MUJOCO_GL=egl python agent/training/rollout.py --model DIR [--placements grid|random]
+MUJOCO_GL=egl python agent/training/rollout.py --model DIR [--layouts grid|random]
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from actions import DIMENSIONS, actions_from_digits, world_from_model
 from generation import generate
 from tokenizer import ACTION_BINS, END
 
-# The contract's range of seeds for held-out random placements.
+# The contract's range of seeds for held-out random layouts.
 EVALUATION_SEED = 3_000_000_000
 GRID = 24
 # Reasoning of 17 tokens, 7 action tokens and `</s>`.
@@ -49,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--tasks", nargs="+", default=list(tasks.load()))
-    parser.add_argument("--placements", choices=["grid", "random"], default="grid")
+    parser.add_argument("--layouts", choices=["grid", "random"], default="grid")
     parser.add_argument("--episodes", type=int, default=GRID, help="of each task")
     parser.add_argument("--temperature", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -63,7 +63,7 @@ def main() -> None:
             policy,
             name,
             arguments.episodes,
-            arguments.placements == "grid",
+            arguments.layouts == "grid",
             arguments.temperature,
             arguments.seed,
         )
@@ -93,9 +93,9 @@ def measure(
     generator = torch.Generator().manual_seed(seed)
     worlds = [World(task) for _ in range(episodes)]
     observations = [
-        world.reset(configuration=index % GRID, seed=seed + index)
+        world.reset(layout=index % GRID, seed=seed + index)
         if grid
-        else world.reset(configuration=None, seed=EVALUATION_SEED + seed + index)
+        else world.reset(layout=None, seed=EVALUATION_SEED + seed + index)
         for index, world in enumerate(worlds)
     ]
     prompt = torch.tensor([policy.tokenizer.prompt(task.instruction)]).expand(episodes, -1)

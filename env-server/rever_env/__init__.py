@@ -1,6 +1,6 @@
 """The world of the four Bridge tasks.
 
-tasks.toml -> tasks -> placement -> world (controller, success, camera, snapshot)
+tasks.toml -> tasks -> layout -> world (controller, success, camera, snapshot)
 world -> expert -> reasoning -> demonstrations; world -> gymnasium_env
 world, robosuite_world, gymnasium_world -> worlds -> session -> server
 server -> remote_session -> remote: the same as Gymnasium environments, in another process

@@ -31,7 +31,7 @@ def _parser() -> argparse.ArgumentParser:
 
     expert = commands.add_parser("expert", help="measure the scripted expert's success")
     _add_tasks(expert)
-    expert.add_argument("--episodes", type=int, default=200, help="random placements per task")
+    expert.add_argument("--episodes", type=int, default=200, help="random layouts per task")
     expert.add_argument("--seed", type=int, default=4_000_000_000)
     expert.add_argument("--processes", type=int, default=2)
     expert.set_defaults(run=_expert)
@@ -53,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
 
     trace = commands.add_parser("trace", help="print every number of an episode")
     trace.add_argument("--task", required=True)
-    trace.add_argument("--configuration", type=int, help="default: drawn from the seed")
+    trace.add_argument("--layout", type=int, help="default: drawn from the seed")
     trace.add_argument("--seed", type=int, default=0)
     trace.add_argument("--side", type=int, default=128, help="of the image (default: 128)")
     trace.add_argument(
@@ -111,7 +111,7 @@ def _trace(arguments: argparse.Namespace) -> int:
 
     (task,) = tasks.choose(tasks.load(), [arguments.task])
     for line in trace.lines(
-        task, arguments.configuration, arguments.seed, arguments.actions, arguments.side
+        task, arguments.layout, arguments.seed, arguments.actions, arguments.side
     ):
         print(line)
     return 0

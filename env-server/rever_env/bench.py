@@ -128,7 +128,7 @@ class _Blocks:
         seconds = []
         for _ in range(_BLOCK + 1):
             if world.memory is None or world.steps >= world.task.steps_max:
-                world.reset(configuration=None, seed=self._seed)
+                world.reset(layout=None, seed=self._seed)
                 self._seed += 1
             action = world.expert_action()
             state = np.empty(mujoco.mj_stateSize(world.model, _STATE))

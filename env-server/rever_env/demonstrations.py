@@ -100,7 +100,7 @@ class Annotator:
 
 def record(world: World, seed: int, noisy: bool) -> dict[str, Any] | None:
     """One episode as arrays; None when the expert failed."""
-    observation = world.reset(configuration=None, seed=seed)
+    observation = world.reset(layout=None, seed=seed)
     noise = Noise(seed, world.task)
     annotator = Annotator.begin(world)
     frames: list[Observation] = []

@@ -17,5 +17,5 @@ class InvalidAction(Fault):
     """The action has the wrong shape, is not finite, or comes when no step is allowed."""
 
 
-class InvalidPlacement(Fault):
-    """What is asked for is not there: a task, a configuration, a seed, a free placement."""
+class InvalidReset(Fault):
+    """What is asked for is not there: a task, a layout, a seed, a free layout."""

@@ -12,7 +12,7 @@ from rever_env import tasks
 from rever_env.spaces import (
     RANDOM_SEEDS,
     check_render_mode,
-    configuration_of,
+    layout_of,
     observation_space,
 )
 from rever_env.world import Observation, World
@@ -23,7 +23,7 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
 
     observation: image uint8 (height, width, 3), state float32 (8,) in Bridge's order,
     instruction text. action: float64 (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open).
-    reset options: {"configuration": 0..23} for a fixed placement; otherwise the seed draws one.
+    reset options: {"layout": 0..23} for a fixed layout; otherwise the seed draws one.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
@@ -49,10 +49,10 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         super().reset(seed=seed)
-        configuration = configuration_of(options)
-        placement_seed = seed if seed is not None else self._drawn_seed()
-        self._last = self.world.reset(configuration=configuration, seed=placement_seed)
-        return _fields(self._last), {"seed": placement_seed}
+        layout = layout_of(options)
+        layout_seed = seed if seed is not None else self._drawn_seed()
+        self._last = self.world.reset(layout=layout, seed=layout_seed)
+        return _fields(self._last), {"seed": layout_seed}
 
     def step(
         self, action: NDArray[np.float64]

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from rever_env.fault import (
     Fault,
     InvalidAction,
-    InvalidPlacement,
+    InvalidReset,
     PhysicsDiverged,
     RendererUnavailable,
 )
-from rever_env.placement import check_configuration
+from rever_env.layout import check_layout
 from rever_env.protocol import Dimension
 from rever_env.spaces import dimensions_of, images_of, numbers_of, value_of
 from rever_env.success import success_alone
@@ -40,11 +40,11 @@ class Making:
     wrapper: Any = None
 
     def make(self, name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":
-        """InvalidPlacement when there is no such environment or it does not take the arguments."""
+        """InvalidReset when there is no such environment or it does not take the arguments."""
         try:
             environment = gymnasium.make(name, **self.arguments, **arguments)
         except (gymnasium.error.Error, ImportError, TypeError) as error:
-            raise InvalidPlacement(f"environment {name}: {error}") from error
+            raise InvalidReset(f"environment {name}: {error}") from error
         return environment if self.wrapper is None else self.wrapper(environment)
 
 
@@ -62,7 +62,7 @@ class GymnasiumTask:
     making: Making
     variant: str = "default"
     version: int = 1
-    configurations: tuple[()] = ()  # the seed draws every start
+    layouts: tuple[()] = ()  # the seed draws every start
 
     @property
     def has_image(self) -> bool:
@@ -81,7 +81,7 @@ def offered(
         try:
             importlib.import_module(package)
         except ImportError as error:
-            raise InvalidPlacement(f"package {package}: {error}") from error
+            raise InvalidReset(f"package {package}: {error}") from error
     return {name: _task(name, making, horizon) for name in names}
 
 
@@ -91,7 +91,7 @@ def imported(path: str) -> Any:
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise InvalidPlacement(f"expected MODULE:NAME, got {path}: {error}") from error
+        raise InvalidReset(f"expected MODULE:NAME, got {path}: {error}") from error
 
 
 def simulator(imports: Iterable[str]) -> str:
@@ -116,7 +116,7 @@ class GymnasiumWorld:
         self._size = (image_height, image_width)
         wants_image = self._size != (0, 0)
         if wants_image and not task.has_image:
-            raise InvalidPlacement(
+            raise InvalidReset(
                 f"task {task.name} has no image: expected 0 x 0, got {image_height} x {image_width}"
             )
         self._environment = _make(task, self._size)
@@ -129,9 +129,9 @@ class GymnasiumWorld:
         self._return = 0.0
         self._last: Any = None
 
-    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+    def reset(self, *, layout: int | None, seed: int) -> Observation:
         """The same seed gives the same start, if the environment keeps Gymnasium's contract."""
-        check_configuration(self.task.name, configuration, 0)
+        check_layout(self.task.name, layout, 0)
         return self._begin(seed)
 
     def step(self, action: NDArray[np.float64]) -> Transition:
@@ -284,9 +284,9 @@ def _task(name: str, making: Making, horizon: int) -> GymnasiumTask:
             state = dimensions_of(environment.observation_space, "observation")
             action = dimensions_of(environment.action_space, "action")
         except ValueError as error:
-            raise InvalidPlacement(f"environment {name}: {error}") from error
+            raise InvalidReset(f"environment {name}: {error}") from error
         if not action:
-            raise InvalidPlacement(f"environment {name}: expected actions of numbers, got none")
+            raise InvalidReset(f"environment {name}: expected actions of numbers, got none")
         spec = environment.spec
         steps_max = spec.max_episode_steps if spec else None
         return GymnasiumTask(
@@ -310,7 +310,7 @@ def _make(task: GymnasiumTask, size: tuple[int, int]) -> "gymnasium.Env[Any, Any
     height, width = size
     try:
         return task.making.make(task.name, render_mode="rgb_array", height=height, width=width)
-    except InvalidPlacement:
+    except InvalidReset:
         return task.making.make(task.name, render_mode="rgb_array")
 
 

@@ -20,7 +20,7 @@ class Chunk:
 
     task: Task
     suite: str  # "grid", "random" or "random, noise"
-    configurations: tuple[int | None, ...]
+    layouts: tuple[int | None, ...]
     seeds: tuple[int, ...]
 
 
@@ -50,10 +50,10 @@ def measure(
     processes: int,
     report: Callable[[str], None],
 ) -> list[Row]:
-    """All 24 configurations, and random placements with and without noise."""
+    """All 24 layouts, and random layouts with and without noise."""
     chunks: list[Chunk] = []
     for task in tasks:
-        grid = tuple(range(len(task.configurations)))
+        grid = tuple(range(len(task.layouts)))
         chunks.append(Chunk(task, "grid", grid, (0,) * len(grid)))
         for suite in ("random", "random, noise"):
             for start in range(0, episodes, _CHUNK):
@@ -83,8 +83,8 @@ def run(chunk: Chunk) -> Row:
     # The images are not looked at: a tiny one keeps rendering cheap.
     with World(chunk.task, image_height=8, image_width=8) as world:
         started = time.perf_counter()
-        for configuration, seed in zip(chunk.configurations, chunk.seeds, strict=True):
-            _episode(world, chunk, configuration, seed, row)
+        for layout, seed in zip(chunk.layouts, chunk.seeds, strict=True):
+            _episode(world, chunk, layout, seed, row)
         row.seconds = time.perf_counter() - started
     return row
 
@@ -130,8 +130,8 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     return max((centre - spread) / scale, 0.0), min((centre + spread) / scale, 1.0)
 
 
-def _episode(world: World, chunk: Chunk, configuration: int | None, seed: int, row: Row) -> None:
-    world.reset(configuration=configuration, seed=seed)
+def _episode(world: World, chunk: Chunk, layout: int | None, seed: int, row: Row) -> None:
+    world.reset(layout=layout, seed=seed)
     noise = Noise(seed, chunk.task) if chunk.suite == "random, noise" else None
     released_at = None
     while True:
@@ -151,7 +151,7 @@ def _episode(world: World, chunk: Chunk, configuration: int | None, seed: int, r
         row.steps_to_release += released_at
         row.worst_steps = max(row.worst_steps, released_at)
     if not transition.statistics.is_success:
-        row.failed += (configuration if configuration is not None else seed,)
+        row.failed += (layout if layout is not None else seed,)
 
 
 def _add(row: Row, part: Row) -> None:

@@ -17,7 +17,7 @@ from rever_env.spaces import (
     RANDOM_SEEDS,
     action_space,
     check_render_mode,
-    configuration_of,
+    layout_of,
     observation_space,
 )
 
@@ -35,7 +35,7 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
     are, session.task.state and session.task.action say; of a Bridge task see BridgeEnv. Without
     images (0 x 0 pixels, or a server that has none) or numbers that part of the observation is left
     out.
-    reset options: {"configuration": 0..} for a fixed placement; otherwise the seed draws one.
+    reset options: {"layout": 0..} for a fixed layout; otherwise the seed draws one.
     expert: info has "expert_action", float32 (n,), what the server's scripted expert would do.
     wait_secs: for a server to be there; reply_secs: for a reply, whatever is sent again meanwhile.
     Raises RemoteFault when the world or the way to it breaks, which is never a reward, and
@@ -115,11 +115,11 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
     def send_reset(self, seed: int | None, options: Fields | None = None) -> None:
         """The first half of reset: returns before the server has answered."""
         super().reset(seed=seed)  # seeds the stream that later resets draw from
-        configuration, task = configuration_of(options), self.session.task
+        layout, task = layout_of(options), self.session.task
         self._seed = int(self.np_random.integers(RANDOM_SEEDS)) if seed is None else seed
         self.session.send(
             lambda sequence: protocol.Reset(
-                sequence, task.task, task.variant, configuration, self._seed
+                sequence, task.task, task.variant, layout, self._seed
             )
         )
 

@@ -12,11 +12,11 @@ from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
 from robosuite.models.tasks import ManipulationTask
 
 from rever_env import expert, tasks
-from rever_env.placement import SEED_LIMIT, place
+from rever_env.layout import SEED_LIMIT, place
 from rever_env.protocol import Statistics
 from rever_env.robosuite_models import WidowX, bridge_arena, fit_scene
 from rever_env.success import Judge, Memory
-from rever_env.tasks import Placement, Task
+from rever_env.tasks import Layout, Task
 from rever_env.world import place_objects
 
 CAMERA = "robot0_third_person"
@@ -68,7 +68,7 @@ class _Stage:
 
 
 class BridgeTask(ManipulationEnv):  # type: ignore[misc]
-    """One Bridge task. begin(configuration, seed) is a reset to a placement that can be repeated;
+    """One Bridge task. begin(layout, seed) is a reset to a layout that can be repeated;
 
     reset() draws one from robosuite's own generator. reward: 1 when the task is solved, else 0.
     """
@@ -79,7 +79,7 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         self, robots: Any = WidowX.__name__, controller_configs: Any = None, **arguments: Any
     ):
         self.task = _renamed(tasks.load()[self.task_name])
-        self._placement: Placement | None = None
+        self._placement: Layout | None = None
         self.memory: Memory | None = None
         arguments.setdefault("control_freq", 5)
         arguments.setdefault("camera_names", CAMERA)
@@ -91,9 +91,9 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
             robots=robots, controller_configs=controller_configs or controller, **arguments
         )
 
-    def begin(self, configuration: int | None, seed: int) -> Any:
+    def begin(self, layout: int | None, seed: int) -> Any:
         """The observation at the start of an episode; the same arguments give the same one."""
-        self._placement = place(self.task, configuration, seed)
+        self._placement = place(self.task, layout, seed)
         try:
             return self.reset()
         finally:
@@ -141,11 +141,11 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
 
     def _reset_internal(self) -> None:
         super()._reset_internal()
-        placement = self._placement
-        if placement is None:
-            placement = place(self.task, None, int(self.rng.integers(SEED_LIMIT)))
+        layout = self._placement
+        if layout is None:
+            layout = place(self.task, None, int(self.rng.integers(SEED_LIMIT)))
         model, data = self.sim.model._model, self._data()
-        place_objects(model, data, self.task, placement)
+        place_objects(model, data, self.task, layout)
         self._settle(model, data)
         self.memory = self.judge.begin(data)
 

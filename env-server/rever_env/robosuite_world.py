@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rever_env import tasks
-from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
-from rever_env.placement import check_configuration
+from rever_env.fault import InvalidAction, InvalidReset, PhysicsDiverged
+from rever_env.layout import check_layout
 from rever_env.pose import in_base
 from rever_env.protocol import Dimension, Statistics
 from rever_env.success import success_alone
@@ -51,7 +51,7 @@ class RobosuiteTask:
     making: Mapping[str, Any]  # for robosuite.make
     camera: str = "agentview"
     version: int = 1
-    configurations: tuple[Any, ...] = ()  # robosuite draws every placement of its own tasks
+    layouts: tuple[Any, ...] = ()  # robosuite draws every layout of its own tasks
     is_bridge: bool = False
     is_one_arm: bool = True
 
@@ -59,7 +59,7 @@ class RobosuiteTask:
 def offered(
     names: Sequence[str], robots: Sequence[str], steps_max: int, control_hz: float
 ) -> dict[str, RobosuiteTask]:
-    """Every named task with every named robot; InvalidPlacement for an unknown name.
+    """Every named task with every named robot; InvalidReset for an unknown name.
 
     robots: ROBOT, or ROBOT+ROBOT for a task of two. A Bridge task has its own robot, horizon and
     rate of control.
@@ -75,7 +75,7 @@ def offered(
     ):
         unknown = sorted(set(given) - set(known))
         if unknown:
-            raise InvalidPlacement(f"{kind}s {unknown}: expected some of {sorted(known)}")
+            raise InvalidReset(f"{kind}s {unknown}: expected some of {sorted(known)}")
     return own | {
         f"{name}/{robot}": _task(
             name,
@@ -97,7 +97,7 @@ def _task(name: str, robot: str, steps_max: int, making: Mapping[str, Any]) -> R
             **making, has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False
         )
     except (AssertionError, ValueError) as error:
-        raise InvalidPlacement(f"task {name} with {robot}: {error}") from error
+        raise InvalidReset(f"task {name} with {robot}: {error}") from error
     is_one_arm = len(environment.robots) == 1 and environment.action_dim == 7
     if is_one_arm:
         bridge = next(iter(tasks.load().values()))
@@ -149,7 +149,7 @@ def _bridge(task: tasks.Task) -> RobosuiteTask:
         {"env_name": robosuite_bridge.ENVIRONMENTS[task.name]},
         robosuite_bridge.CAMERA,
         task.version,
-        task.configurations,
+        task.layouts,
         is_bridge=True,
     )
 
@@ -199,13 +199,13 @@ class RobosuiteWorld:
         self._ever_success = False
         self._last: Observation | None = None
 
-    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+    def reset(self, *, layout: int | None, seed: int) -> Observation:
         """The same seed gives the same bytes: robosuite's generators are set again in place."""
         environment = self._environment
-        check_configuration(self.task.name, configuration, len(self.task.configurations))
+        check_layout(self.task.name, layout, len(self.task.layouts))
         self._make_current()
         if self.task.is_bridge:
-            observation = environment.begin(configuration, seed)
+            observation = environment.begin(layout, seed)
         else:
             self._seed(seed)
             observation = environment.reset()
@@ -214,7 +214,7 @@ class RobosuiteWorld:
         return self._observe(observation)
 
     def _seed(self, seed: int) -> None:
-        # 1.5.2 ignores the seed that its Gymnasium wrapper is given; the placement sampler keeps
+        # 1.5.2 ignores the seed that its Gymnasium wrapper is given; the layout sampler keeps
         # the generator object, so that its state is what must be replaced.
         state = np.random.default_rng(seed).bit_generator.state
         self._environment.rng.bit_generator.state = state

@@ -203,7 +203,7 @@ class Server:
                     version=task.version,
                     instruction=task.instruction,
                     steps_max=task.steps_max,
-                    configurations=len(task.configurations),
+                    layouts=len(task.layouts),
                     state=task.state,
                     action=task.action,
                 )

@@ -77,7 +77,7 @@ class Session:
         try:
             reply = self._reply(request)
             return reply if isinstance(reply, bytes) else protocol.REPLY.encode(reply)
-        except (_Wrong, UnknownTask, world.InvalidAction, world.InvalidPlacement) as error:
+        except (_Wrong, UnknownTask, world.InvalidAction, world.InvalidReset) as error:
             return refused(sequence, str(error))
         except world.PhysicsDiverged as error:
             return self._fault(sequence, protocol.FaultKind.PHYSICS_DIVERGED, str(error))
@@ -126,7 +126,7 @@ class Session:
         if self._world is None or key != self._key:
             observation = self._change(key, request)
         else:
-            observation = self._world.reset(configuration=request.configuration, seed=request.seed)
+            observation = self._world.reset(layout=request.layout, seed=request.seed)
         self._slots.clear()
         self._running = True
         return observation
@@ -135,8 +135,8 @@ class Session:
         """Resets another world and takes it in place of this one, which a refusal leaves alone."""
         fresh = self._worlds.take(key)
         try:
-            observation = fresh.reset(configuration=request.configuration, seed=request.seed)
-        except (world.InvalidAction, world.InvalidPlacement):
+            observation = fresh.reset(layout=request.layout, seed=request.seed)
+        except (world.InvalidAction, world.InvalidReset):
             self._worlds.give_back(key, fresh)
             raise
         except Exception:

@@ -54,23 +54,23 @@ def box(dimensions: Sequence[Dimension]) -> spaces.Box:
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
 
-def configuration_of(options: dict[str, Any] | None) -> int | None:
-    """The fixed placement that reset's options ask for; ValueError for any other option."""
+def layout_of(options: dict[str, Any] | None) -> int | None:
+    """The fixed layout that reset's options ask for; ValueError for any other option."""
     options = options or {}
-    unknown = set(options) - {"configuration"}
+    unknown = set(options) - {"layout"}
     if unknown:
-        raise ValueError(f"reset options: expected only 'configuration', got {sorted(unknown)}")
-    configuration = options.get("configuration")
-    if configuration is None:
+        raise ValueError(f"reset options: expected only 'layout', got {sorted(unknown)}")
+    layout = options.get("layout")
+    if layout is None:
         return None
     try:
-        number = operator.index(configuration)
+        number = operator.index(layout)
     except TypeError:
         number = -1
-    if isinstance(configuration, bool) or not 0 <= number < 1 << 32:
+    if isinstance(layout, bool) or not 0 <= number < 1 << 32:
         raise ValueError(
-            "reset options: configuration: expected a whole number from 0 to 4294967295, "
-            f"got {configuration!r}"
+            "reset options: layout: expected a whole number from 0 to 4294967295, "
+            f"got {layout!r}"
         )
     return number
 

@@ -10,7 +10,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-from rever_env.fault import InvalidPlacement
+from rever_env.fault import InvalidReset
 from rever_env.protocol import Dimension
 
 Triple = tuple[float, float, float]
@@ -18,7 +18,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Placement:
+class Layout:
     """Where source and target start: metres in the world frame, yaw in degrees."""
 
     source_x: float
@@ -30,7 +30,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class RandomRanges:
-    """The box random placements are drawn from, and what is kept out of it."""
+    """The box random layouts are drawn from, and what is kept out of it."""
 
     source_x: Range
     source_y: Range
@@ -114,7 +114,7 @@ class Task:
     hover: float
     release_gap: float
     random: RandomRanges
-    configurations: tuple[Placement, ...]
+    layouts: tuple[Layout, ...]
     settings: WorldSettings
     inverse_kinematics: InverseKinematics
     grasp: GraspRule
@@ -136,8 +136,8 @@ def load(assets: Path | None = None) -> dict[str, Task]:
         fields = _tuples(table)
         fields["scene"] = folder / fields["scene"]
         fields["random"] = RandomRanges(**_tuples(fields["random"]))
-        rows = fields.pop("grid")["configurations"]
-        fields["configurations"] = tuple(Placement(*row) for row in rows)
+        rows = fields.pop("grid")["layouts"]
+        fields["layouts"] = tuple(Layout(*row) for row in rows)
         fields.setdefault("target_height", None)
         tasks[name] = Task(
             name=name,
@@ -171,5 +171,5 @@ def choose(tasks: dict[str, Task], names: list[str] | None) -> list[Task]:
     """The named tasks in the file's order; all when no names are given."""
     unknown = [name for name in names or [] if name not in tasks]
     if unknown:
-        raise InvalidPlacement(f"tasks {unknown}: expected some of {sorted(tasks)}")
+        raise InvalidReset(f"tasks {unknown}: expected some of {sorted(tasks)}")
     return [task for name, task in tasks.items() if not names or name in names]

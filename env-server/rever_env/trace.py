@@ -15,7 +15,7 @@ from rever_env.world import Observation, Statistics, World
 
 
 def lines(
-    task: Task, configuration: int | None, seed: int, actions: Path | None, side: int
+    task: Task, layout: int | None, seed: int, actions: Path | None, side: int
 ) -> Iterator[str]:
     """One JSON object for the reset and one for each step, to the horizon or the actions' end.
 
@@ -23,7 +23,7 @@ def lines(
     line, 7 numbers; without it the scripted expert acts.
     """
     with World(task, side, side) as world:
-        observation = world.reset(configuration=configuration, seed=seed)
+        observation = world.reset(layout=layout, seed=seed)
         yield _line(world, observation, None)
         for action in read(actions) if actions else _expert(world):
             transition = world.step(action)

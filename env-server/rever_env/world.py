@@ -13,20 +13,20 @@ from rever_env.controller import Controller, consecutive
 from rever_env.fault import (
     Fault,
     InvalidAction,
-    InvalidPlacement,
+    InvalidReset,
     PhysicsDiverged,
     RendererUnavailable,
 )
-from rever_env.placement import place
+from rever_env.layout import place
 from rever_env.pose import in_base
 from rever_env.protocol import Statistics
 from rever_env.success import Judge, Memory
-from rever_env.tasks import Placement, Task
+from rever_env.tasks import Layout, Task
 
 __all__ = [
     "Fault",
     "InvalidAction",
-    "InvalidPlacement",
+    "InvalidReset",
     "Observation",
     "PhysicsDiverged",
     "RendererUnavailable",
@@ -102,15 +102,15 @@ class World:
         self._tcp = self.model.site(task.settings.tcp).id
         self._finger_range = self.model.joint(task.settings.finger_joints[0]).range.copy()
 
-    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+    def reset(self, *, layout: int | None, seed: int) -> Observation:
         """Places and settles the objects; the same arguments give the same bytes."""
-        placement = place(self.task, configuration, seed)
+        placed = place(self.task, layout, seed)
         mujoco.mj_resetData(self.model, self.data)
         self.memory = None
         joints = np.array(self.task.robot_joints)
         self.data.qpos[: len(joints)] = joints
         self.data.ctrl[:] = joints
-        place_objects(self.model, self.data, self.task, placement)
+        place_objects(self.model, self.data, self.task, placed)
         self._settle()
         self.steps = 0
         self.controller.reset(self.data)
@@ -283,13 +283,13 @@ def divergence(data: mujoco.MjData) -> list[str]:
 
 
 def place_objects(
-    model: mujoco.MjModel, data: mujoco.MjData, task: Task, placement: Placement
+    model: mujoco.MjModel, data: mujoco.MjData, task: Task, layout: Layout
 ) -> None:
     """Puts source and target above where they will rest."""
-    rows = [(task.source, placement.source_x, placement.source_y, task.source_height)]
-    yaws = [placement.source_yaw]
+    rows = [(task.source, layout.source_x, layout.source_y, task.source_height)]
+    yaws = [layout.source_yaw]
     if task.target_height is not None:
-        rows.append((task.target, placement.target_x, placement.target_y, task.target_height))
+        rows.append((task.target, layout.target_x, layout.target_y, task.target_height))
         yaws.append(0.0)
     for (name, x, y, height), yaw in zip(rows, yaws, strict=True):
         start = model.joint(name).qposadr[0]

@@ -28,7 +28,7 @@ class OfferedTask(Protocol):
     @property
     def steps_max(self) -> int: ...
     @property
-    def configurations(self) -> Sized: ...
+    def layouts(self) -> Sized: ...
     @property
     def state(self) -> tuple[Dimension, ...]: ...
     @property
@@ -38,7 +38,7 @@ class OfferedTask(Protocol):
 class AnyWorld(Protocol):
     """What a session needs of a world, whatever simulates it; its errors: rever_env.fault."""
 
-    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+    def reset(self, *, layout: int | None, seed: int) -> Observation:
         """The same arguments give the same bytes."""
         ...
 

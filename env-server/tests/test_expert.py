@@ -1,4 +1,4 @@
-"""The expert: succeeds on a few placements of each task, clean and disturbed, and says why."""
+"""The expert: succeeds on a few layouts of each task, clean and disturbed, and says why."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ from rever_env.world import World
 
 
 @pytest.mark.parametrize(
-    ("suite", "configurations", "seeds"),
+    ("suite", "layouts", "seeds"),
     [
         ("grid", (1, 22), (0, 0)),
         ("random", (None, None), (5, 6)),
@@ -21,14 +21,14 @@ from rever_env.world import World
     ],
 )
 def test_the_expert_succeeds(
-    task: Task, suite: str, configurations: tuple[int | None, ...], seeds: tuple[int, ...]
+    task: Task, suite: str, layouts: tuple[int | None, ...], seeds: tuple[int, ...]
 ) -> None:
-    row = measurement.run(Chunk(task, suite, configurations, seeds))
+    row = measurement.run(Chunk(task, suite, layouts, seeds))
     assert (row.episodes, row.successes, row.released, row.grasped) == (2, 2, 2, 2), row
 
 
 def test_asking_the_expert_changes_nothing(world: World) -> None:
-    world.reset(configuration=0, seed=0)
+    world.reset(layout=0, seed=0)
     before = world.save()
     first = world.expert_action()
     assert np.array_equal(first, world.expert_action())
@@ -36,7 +36,7 @@ def test_asking_the_expert_changes_nothing(world: World) -> None:
 
 
 def test_moves_are_moderate_and_keep_the_gripper_upright(world: World) -> None:
-    world.reset(configuration=5, seed=0)
+    world.reset(layout=5, seed=0)
     for _ in range(40):
         action = world.expert_action()
         assert np.linalg.norm(action[:3]) <= 0.035 + 1e-9

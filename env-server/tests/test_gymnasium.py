@@ -33,8 +33,8 @@ def test_the_checker_passes_without_a_warning(task: Task) -> None:
 
 def test_it_is_the_same_world(task: Task, world: World) -> None:
     environment = gymnasium.make(task.gymnasium_id)
-    observation, info = environment.reset(seed=9, options={"configuration": 4})
-    expected = world.reset(configuration=4, seed=9)
+    observation, info = environment.reset(seed=9, options={"layout": 4})
+    expected = world.reset(layout=4, seed=9)
     assert np.array_equal(observation["image"], expected.image)
     assert observation["instruction"] == task.instruction and info == {"seed": 9}
     action = np.array([0.01, 0.0, -0.01, 0.0, 0.0, 0.0, -1.0])
@@ -48,7 +48,7 @@ def test_it_is_the_same_world(task: Task, world: World) -> None:
 
 def test_unknown_options_are_refused(task: Task) -> None:
     environment = gymnasium.make(task.gymnasium_id)
-    with pytest.raises(ValueError, match="expected only 'configuration'"):
+    with pytest.raises(ValueError, match="expected only 'layout'"):
         environment.reset(options={"configuraton": 4})
     environment.close()
 

@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
+from rever_env.fault import InvalidAction, InvalidReset, PhysicsDiverged
 from rever_env.gymnasium_world import GymnasiumWorld, Making, NotReproducible, imported, offered
 from rever_env.protocol import Dimension
 from rever_env.server import Server, ServerOptions
@@ -118,7 +118,7 @@ def test_resets_and_steps_give_the_same_bytes_in_any_world(pair: list[GymnasiumW
     chosen = actions(pair[0], 6)
 
     def run(world: GymnasiumWorld, seed: int) -> list[Observation]:
-        seen = [world.reset(configuration=None, seed=seed)]
+        seen = [world.reset(layout=None, seed=seed)]
         return seen + [world.step(action).observation for action in chosen]
 
     expected = run(pair[0], 3)
@@ -133,12 +133,12 @@ def test_resets_and_steps_give_the_same_bytes_in_any_world(pair: list[GymnasiumW
 def test_save_and_restore_are_exact(pair: list[GymnasiumWorld]) -> None:
     world, other = pair
     chosen = actions(world, 6)
-    world.reset(configuration=None, seed=3)
+    world.reset(layout=None, seed=3)
     saved_at = [world.step(action) for action in chosen[:3]][-1]
     saved = world.save()
     expected = [world.step(action) for action in chosen[3:]]
-    other.reset(configuration=None, seed=5)
-    world.reset(configuration=None, seed=6)
+    other.reset(layout=None, seed=5)
+    world.reset(layout=None, seed=6)
     assert same(world.restore(saved), saved_at.observation)
     for action, before in zip(chosen[3:], expected, strict=True):
         again = world.step(action)
@@ -151,7 +151,7 @@ def test_a_picture_in_the_observation_is_the_image() -> None:
     task = offered(["CartPole-v1"], [], making, 50)["CartPole-v1"]
     assert (len(task.state), task.has_image) == (0, True)
     world = GymnasiumWorld(task, 400, 600)
-    world.reset(configuration=None, seed=1)
+    world.reset(layout=None, seed=1)
     first = world.step(np.array([1.0])).observation
     own: Any = gymnasium.make("CartPole-v1", render_mode="rgb_array")
     own.reset(seed=1)
@@ -160,7 +160,7 @@ def test_a_picture_in_the_observation_is_the_image() -> None:
     saved = world.save()
     world.step(np.array([0.0]))
     assert same(world.restore(saved), first)
-    half = GymnasiumWorld(task, 200, 300).reset(configuration=None, seed=1).image
+    half = GymnasiumWorld(task, 200, 300).reset(layout=None, seed=1).image
     assert half.shape == (200, 300, 3) and half.std() > 1.0
 
 
@@ -188,7 +188,7 @@ def test_a_space_becomes_numbers_and_numbers_a_value() -> None:
 def test_a_return_that_reaches_the_threshold_is_success() -> None:
     """CartPole-v1 asks for a return of 475 of 500: pushing against the fall gets it."""
     world = make("CartPole-v1", 0, 0)
-    state = world.reset(configuration=None, seed=0).state
+    state = world.reset(layout=None, seed=0).state
     for step in range(1, 501):
         force = float(state[2] + 0.3 * state[3] + 0.02 * state[0] + 0.05 * state[1] > 0)
         transition = world.step(np.array([force]))
@@ -199,18 +199,18 @@ def test_a_return_that_reaches_the_threshold_is_success() -> None:
 
 
 def test_what_is_wrong_is_said() -> None:
-    with pytest.raises(InvalidPlacement, match="NoSuchWorld"):
+    with pytest.raises(InvalidReset, match="NoSuchWorld"):
         make("NoSuchWorld-v0", 0, 0)
-    with pytest.raises(InvalidPlacement, match="package no_such_package"):
+    with pytest.raises(InvalidReset, match="package no_such_package"):
         make("CartPole-v1", 0, 0, "no_such_package")
-    with pytest.raises(InvalidPlacement, match="expected MODULE:NAME"):
+    with pytest.raises(InvalidReset, match="expected MODULE:NAME"):
         imported("gymnasium.wrappers")
     world = make("CartPole-v1", 0, 0)
     with pytest.raises(InvalidAction, match="before reset"):
         world.step(np.array([0.0]))
-    world.reset(configuration=None, seed=0)
-    with pytest.raises(InvalidPlacement, match="configuration 2"):
-        world.reset(configuration=2, seed=0)
+    world.reset(layout=None, seed=0)
+    with pytest.raises(InvalidReset, match="layout 2"):
+        world.reset(layout=2, seed=0)
     for wrong, words in (
         ([0.0, 0.0], r"expected shape \(1,\)"),
         ([0.5], "expected a whole number from 0 to 1, got 0.5"),
@@ -239,7 +239,7 @@ def test_what_was_seen_stays_as_it_was() -> None:
     gymnasium.register("rever-tests/Redrawn-v0", entry_point=lambda **_: Redrawn())
     try:
         world = make("rever-tests/Redrawn-v0", 16, 32)
-        seen = [world.reset(configuration=None, seed=0).image]
+        seen = [world.reset(layout=None, seed=0).image]
         seen += [world.step(np.array([0.0])).observation.image for _ in range(2)]
         assert [image.mean() for image in seen] == [0.0, 1.0, 2.0]
     finally:
@@ -250,13 +250,13 @@ def test_an_environment_that_breaks_or_does_not_repeat_itself_is_a_fault() -> No
     gymnasium.register("rever-tests/Fickle-v0", entry_point=lambda **_: Fickle())
     try:
         world = make("rever-tests/Fickle-v0", 0, 0)
-        with pytest.raises(InvalidPlacement, match="has no image"):
+        with pytest.raises(InvalidReset, match="has no image"):
             make("rever-tests/Fickle-v0", 24, 40)
-        world.reset(configuration=None, seed=0)
+        world.reset(layout=None, seed=0)
         saved = world.save()
         with pytest.raises(NotReproducible, match="led to another state"):
             world.restore(saved)
-        world.reset(configuration=None, seed=0)
+        world.reset(layout=None, seed=0)
         with pytest.raises(PhysicsDiverged, match=r"observation\[0\] is nan"):
             world.step(np.array([1.0]))
         with pytest.raises(InvalidAction, match="before reset"):
@@ -268,12 +268,12 @@ def test_an_environment_that_breaks_or_does_not_repeat_itself_is_a_fault() -> No
 def test_physics_that_started_anew_is_a_fault() -> None:
     """MuJoCo resets what has diverged by itself: nothing in the observation tells."""
     world = make("Hopper-v5", 0, 0)
-    world.reset(configuration=None, seed=0)
+    world.reset(layout=None, seed=0)
     still = np.zeros(len(world.task.action))
     world.step(still)
     environment: Any = world._environment.unwrapped
     environment.data.qvel[0] = 1e12
     with pytest.raises(PhysicsDiverged, match="mjWARN_BADQVEL"):
         world.step(still)
-    world.reset(configuration=None, seed=0)
+    world.reset(layout=None, seed=0)
     world.step(still)

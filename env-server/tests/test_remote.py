@@ -106,10 +106,10 @@ class Slow(World):
 
     naps: ClassVar[list[float]] = [3.2]
 
-    def reset(self, *, configuration: int | None, seed: int) -> Observation:
+    def reset(self, *, layout: int | None, seed: int) -> Observation:
         if self.naps:
             time.sleep(self.naps.pop())
-        return super().reset(configuration=configuration, seed=seed)
+        return super().reset(layout=layout, seed=seed)
 
 
 def test_who_waits_for_a_slow_world_is_not_taken_for_silent() -> None:
@@ -163,8 +163,8 @@ def test_a_session_that_the_server_ended_says_why_and_closes_at_once() -> None:
 
 def test_it_is_the_same_world(endpoint: str, task: Task, world: World) -> None:
     remote = rever_env.RemoteEnv(endpoint, task.name, expert=True)
-    observation, info = remote.reset(seed=9, options={"configuration": 4})
-    expected = world.reset(configuration=4, seed=9)
+    observation, info = remote.reset(seed=9, options={"layout": 4})
+    expected = world.reset(layout=4, seed=9)
     for _ in range(5):
         assert np.array_equal(observation["image"], expected.image)
         assert np.array_equal(observation["state"], expected.state)
@@ -196,14 +196,14 @@ def test_what_is_wrong_is_said(endpoint: str) -> None:
         remote.step(STILL)
     with pytest.raises(ValueError, match=r"expected shape \(7,\), got \(6,\)"):
         remote.step(np.zeros(6, np.float32))
-    with pytest.raises(ValueError, match="expected only 'configuration'"):
+    with pytest.raises(ValueError, match="expected only 'layout'"):
         remote.reset(options={"configuraton": 4})
-    for configuration in (-1, 3.0, True, 1 << 32):
+    for layout in (-1, 3.0, True, 1 << 32):
         with pytest.raises(ValueError, match="expected a whole number from 0 to 4294967295, got"):
-            remote.reset(options={"configuration": configuration})
-    with pytest.raises(RemoteRefused, match="configuration 999: expected"):
-        remote.reset(options={"configuration": 999})
-    remote.reset(seed=0, options={"configuration": np.int64(3)})
+            remote.reset(options={"layout": layout})
+    with pytest.raises(RemoteRefused, match="layout 999: expected"):
+        remote.reset(options={"layout": 999})
+    remote.reset(seed=0, options={"layout": np.int64(3)})
     with pytest.raises(ValueError, match="expected finite numbers"):
         remote.step(np.full(7, np.nan, np.float32))
     remote.close()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rever_env import tasks
-from rever_env.fault import InvalidAction, InvalidPlacement, PhysicsDiverged
+from rever_env.fault import InvalidAction, InvalidReset, PhysicsDiverged
 from rever_env.world import Observation, World
 
 pytest.importorskip("robosuite")
@@ -32,7 +32,7 @@ def worlds() -> Iterator[list[RobosuiteWorld]]:
 
 
 def run(world: RobosuiteWorld, seed: int) -> list[Observation]:
-    observations = [world.reset(configuration=None, seed=seed)]
+    observations = [world.reset(layout=None, seed=seed)]
     return observations + [world.step(MOVE).observation for _ in range(5)]
 
 
@@ -53,7 +53,7 @@ def test_the_same_seed_gives_the_same_bytes_in_any_world(worlds: list[RobosuiteW
 
 def test_save_and_restore_are_bit_exact(worlds: list[RobosuiteWorld]) -> None:
     world, _, other = worlds
-    world.reset(configuration=None, seed=3)
+    world.reset(layout=None, seed=3)
     saved_at = world.step(MOVE).observation
     saved = world.save()
     expected = [world.step(MOVE).observation for _ in range(4)]
@@ -65,7 +65,7 @@ def test_save_and_restore_are_bit_exact(worlds: list[RobosuiteWorld]) -> None:
 
 def test_an_action_moves_the_gripper_as_far_as_it_says(worlds: list[RobosuiteWorld]) -> None:
     world = worlds[0]
-    before = world.reset(configuration=None, seed=1).state
+    before = world.reset(layout=None, seed=1).state
     for _ in range(5):
         after = world.step(np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0, 1.0])).observation.state
     assert 0.02 < after[2] - before[2] < 0.1
@@ -75,27 +75,27 @@ def test_an_action_moves_the_gripper_as_far_as_it_says(worlds: list[RobosuiteWor
 
 def test_what_is_wrong_is_said(worlds: list[RobosuiteWorld]) -> None:
     world = worlds[0]
-    with pytest.raises(InvalidPlacement, match="Fold"):
+    with pytest.raises(InvalidReset, match="Fold"):
         offered(["Fold"], ["Panda"], 6, 20.0)
-    with pytest.raises(InvalidPlacement, match="TwoArmLift with Panda"):
+    with pytest.raises(InvalidReset, match="TwoArmLift with Panda"):
         offered(["TwoArmLift"], ["Panda"], 6, 20.0)
-    with pytest.raises(InvalidPlacement, match="configuration 0"):
-        world.reset(configuration=0, seed=0)
+    with pytest.raises(InvalidReset, match="layout 0"):
+        world.reset(layout=0, seed=0)
     run(world, 0)
     world.step(MOVE)
     for _ in range(2):
         with pytest.raises(InvalidAction, match="step 7: expected at most 6"):
             world.step(MOVE)
         # What is refused changes nothing: the episode is still at its end.
-        with pytest.raises(InvalidPlacement, match="configuration 0"):
-            world.reset(configuration=0, seed=0)
+        with pytest.raises(InvalidReset, match="layout 0"):
+            world.reset(layout=0, seed=0)
 
 
 def test_physics_that_started_anew_is_a_fault(worlds: list[RobosuiteWorld]) -> None:
     """MuJoCo resets what has diverged by itself: nothing that robosuite gives tells."""
     world = worlds[0]
     expected = run(world, 2)
-    world.reset(configuration=None, seed=2)
+    world.reset(layout=None, seed=2)
     world.step(MOVE)
     world._environment.sim.data._data.qvel[0] = 1e12
     with pytest.raises(PhysicsDiverged, match="mjWARN_BADQVEL"):
@@ -111,8 +111,8 @@ def test_a_world_that_is_closed_takes_no_other_worlds_pictures(
     first = worlds[0]
     expected = run(first, 4)
     other = RobosuiteWorld(offered(["Stack"], ["Panda"], 6, 20.0)["Stack/Panda"], 24, 40)
-    other.reset(configuration=None, seed=0)
-    first.reset(configuration=None, seed=4)
+    other.reset(layout=None, seed=0)
+    first.reset(layout=None, seed=4)
     other.close()
     del other
     gc.collect()
@@ -129,13 +129,13 @@ def test_two_arms_take_robosuites_own_actions() -> None:
     def steps(count: int) -> list[Observation]:
         return [world.step(move).observation for _ in range(count)]
 
-    expected = [world.reset(configuration=None, seed=2), *steps(2)]
+    expected = [world.reset(layout=None, seed=2), *steps(2)]
     assert len(expected[0].state) == len(world.task.state)
     saved = world.save()
     after = steps(3)
-    again = [world.reset(configuration=None, seed=2), *steps(2)]
+    again = [world.reset(layout=None, seed=2), *steps(2)]
     assert all(same(*pair) for pair in zip(expected, again, strict=True))
-    world.reset(configuration=None, seed=3)
+    world.reset(layout=None, seed=3)
     world.restore(saved)
     assert all(same(*pair) for pair in zip(after, steps(3), strict=True))
     with pytest.raises(InvalidAction, match=r"expected shape \(14,\)"):
@@ -154,10 +154,10 @@ def bridge() -> Iterator[RobosuiteWorld]:
 @pytest.mark.parametrize("task", list(tasks.load()))
 def test_a_bridge_task_starts_as_ours_does(task: str) -> None:
     bridge = RobosuiteWorld(offered([task], [], 6, 20.0)[task], 96, 128)
-    seen = bridge.reset(configuration=5, seed=0)
+    seen = bridge.reset(layout=5, seed=0)
     bridge.close()
     with World(tasks.load()[task], 96, 128) as ours:
-        expected = ours.reset(configuration=5, seed=0)
+        expected = ours.reset(layout=5, seed=0)
     assert np.abs(seen.state - expected.state).max() < 1e-3
     assert seen.instruction == expected.instruction
     # Objects settle a little differently under robosuite's solver; nothing else may differ.
@@ -172,7 +172,7 @@ def test_bridge_tasks_are_reproducible_and_saved_exactly(bridge: RobosuiteWorld)
     assert all(same(*pair) for pair in zip(expected, again, strict=True))
     saved = bridge.save()
     after = [bridge.step(MOVE) for _ in range(3)]
-    bridge.reset(configuration=0, seed=0)
+    bridge.reset(layout=0, seed=0)
     bridge.restore(saved)
     for transition in after:
         repeated = bridge.step(MOVE)
@@ -183,7 +183,7 @@ def test_bridge_tasks_are_reproducible_and_saved_exactly(bridge: RobosuiteWorld)
 @pytest.mark.parametrize("task", list(tasks.load()))
 def test_the_expert_solves_the_bridge_tasks_in_robosuite(task: str) -> None:
     world = RobosuiteWorld(offered([task], [], 6, 20.0)[task], 0, 0)
-    world.reset(configuration=None, seed=2_000_000_000)
+    world.reset(layout=None, seed=2_000_000_000)
     transition = world.step(world.expert_action())
     while not transition.truncated:
         transition = world.step(world.expert_action())

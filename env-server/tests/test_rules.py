@@ -24,7 +24,7 @@ _THRESHOLDS = {
 
 
 def test_the_arm_starts_where_the_published_one_does(world: World, task: Task) -> None:
-    state = world.reset(configuration=0, seed=0).state
+    state = world.reset(layout=0, seed=0).state
     scene = "sink" if "eggplant" in task.name else "table"
     assert state[:3] == pytest.approx(_START[scene], abs=2e-4)
     assert state[6:] == pytest.approx([0.0, 1.0], abs=1e-3)
@@ -32,7 +32,7 @@ def test_the_arm_starts_where_the_published_one_does(world: World, task: Task) -
 
 
 def test_success_thresholds_equal_the_published_ones(world: World, task: Task) -> None:
-    world.reset(configuration=0, seed=0)
+    world.reset(layout=0, seed=0)
     memory = world.running_memory()
     horizontal = math.hypot(*memory.target_half[:2]) + task.grasp.target_margin
     vertical = memory.target_half[2] + memory.source_half[2] + task.height_offset_max
@@ -40,11 +40,11 @@ def test_success_thresholds_equal_the_published_ones(world: World, task: Task) -
 
 
 def test_objects_rest_after_reset(world: World, task: Task) -> None:
-    for configuration in (0, 13, 23):
-        world.reset(configuration=configuration, seed=0)
-        placement = task.configurations[configuration]
+    for layout in (0, 13, 23):
+        world.reset(layout=layout, seed=0)
+        layout = task.layouts[layout]
         source = world.data.body(task.source)
-        assert source.xpos[:2] == pytest.approx([placement.source_x, placement.source_y], abs=3e-3)
+        assert source.xpos[:2] == pytest.approx([layout.source_x, layout.source_y], abs=3e-3)
         before = source.xpos.copy()
         for _ in range(3):
             world.step(np.array([0.0] * 6 + [1.0]))
@@ -53,7 +53,7 @@ def test_objects_rest_after_reset(world: World, task: Task) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_translation_moves_the_tool_in_the_base_frame(cube_world: World, axis: int) -> None:
-    start = cube_world.reset(configuration=0, seed=0).state[:3].astype(float)
+    start = cube_world.reset(layout=0, seed=0).state[:3].astype(float)
     action = np.array([0.0] * 6 + [1.0])
     action[axis] = 0.02
     cube_world.step(action)
@@ -67,7 +67,7 @@ def test_a_translation_moves_the_tool_in_the_base_frame(cube_world: World, axis:
 
 
 def test_a_turn_is_about_the_tool_and_the_base_axes(cube_world: World) -> None:
-    start = cube_world.reset(configuration=0, seed=0).state
+    start = cube_world.reset(layout=0, seed=0).state
     for _ in range(2):
         cube_world.step(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.2, 1.0]))
     for _ in range(12):
@@ -77,7 +77,7 @@ def test_a_turn_is_about_the_tool_and_the_base_axes(cube_world: World) -> None:
 
 
 def test_an_unreachable_target_keeps_the_arm_where_it_is(cube_world: World) -> None:
-    start = cube_world.reset(configuration=0, seed=0).state
+    start = cube_world.reset(layout=0, seed=0).state
     state = cube_world.step(np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])).observation.state
     assert state[:3] == pytest.approx(start[:3], abs=5e-3)
 
@@ -96,7 +96,7 @@ def test_any_image_shape_shows_the_same_field_of_view(task: Task) -> None:
     means = []
     for height, width in ((480, 640), (128, 128)):
         with World(task, height, width) as shaped:
-            image = shaped.reset(configuration=0, seed=0).image
+            image = shaped.reset(layout=0, seed=0).image
             assert image.shape == (height, width, 3)
             # (height, width, 3) -> (16, 16, 3): mean colours of a coarse grid
             blocks = image.reshape(16, height // 16, 16, width // 16, 3).mean(axis=(1, 3))
@@ -105,21 +105,21 @@ def test_any_image_shape_shows_the_same_field_of_view(task: Task) -> None:
 
 
 def test_projection_agrees_with_the_image(world: World, task: Task) -> None:
-    world.reset(configuration=0, seed=0)
+    world.reset(layout=0, seed=0)
     seen = world.camera.bodies(world.data) == world.model.body(task.source).id
     x, y = world.camera.project(world.data, world.data.body(task.source).xipos)
     assert seen[int(y * 128), int(x * 128)]
 
 
 def test_a_finger_touching_nothing_is_no_grasp(cube_world: World) -> None:
-    cube_world.reset(configuration=0, seed=0)
+    cube_world.reset(layout=0, seed=0)
     for _ in range(4):
         statistics = cube_world.step(np.array([0.0] * 6 + [-1.0])).statistics
     assert not statistics.is_grasped and not statistics.ever_grasped
 
 
 def test_a_held_object_over_the_target_is_success_but_not_released(world: World) -> None:
-    world.reset(configuration=0, seed=0)
+    world.reset(layout=0, seed=0)
     held_successes = 0
     while world.steps < world.task.steps_max:
         statistics = world.step(world.expert_action()).statistics
@@ -136,7 +136,7 @@ def test_pushing_the_target_counts_as_the_wrong_object(task: Task) -> None:
     if task.target_height is None:
         pytest.skip("the basket cannot be moved")
     with World(task) as pushed:
-        pushed.reset(configuration=0, seed=0)
+        pushed.reset(layout=0, seed=0)
         joint = pushed.model.joint(task.target)
         pushed.data.qpos[joint.qposadr[0]] += 0.04
         mujoco.mj_forward(pushed.model, pushed.data)

@@ -132,7 +132,7 @@ def test_a_refused_reset_of_another_task_changes_nothing(session: Session, world
     ask(session, protocol.Save(3, 1))
     stepped = ask(session, protocol.Step(4, STILL))
     ask(session, protocol.Restore(5, 1))
-    check_refused(ask(session, protocol.Reset(6, CUBE, "default", 999, 7)), 6, "configuration")
+    check_refused(ask(session, protocol.Reset(6, CUBE, "default", 999, 7)), 6, "layout")
     again = ask(session, protocol.Step(7, STILL))
     assert isinstance(stepped, protocol.Stepped) and isinstance(again, protocol.Stepped)
     assert stepped.transition == again.transition
@@ -275,8 +275,8 @@ def test_a_server_describes_itself_and_ends_on_a_signal() -> None:
         ready = first_line(process)
         assert ready.startswith("ready ")
         name = ready.split()[1]
-        configuration = Endpoints((endpoint,), (), False).configuration()
-        with zenoh.open(zenoh.Config.from_json5(configuration)) as network:
+        settings = Endpoints((endpoint,), (), False).configuration()
+        with zenoh.open(zenoh.Config.from_json5(settings)) as network:
             for reply in network.get(protocol.Keys("home").describe(name), timeout=WAIT_SECS):
                 description = protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes())
         assert (description.server, description.sessions_max) == (name, 3)
@@ -292,8 +292,8 @@ def started(thread: threading.Thread) -> Callable[[str], None]:
 
 def test_a_network_can_be_closed_after_a_server_that_was_being_asked(worlds: Worlds) -> None:
     endpoint = free_endpoint()
-    here = Endpoints((), (endpoint,), False).configuration()
-    there = Endpoints((endpoint,), (), False).configuration()
+    here = Endpoints((), (endpoint,), False).layout()
+    there = Endpoints((endpoint,), (), False).layout()
     with zenoh.open(zenoh.Config.from_json5(here)) as asker:
         for _ in range(20):
             stop = threading.Event()
@@ -331,16 +331,16 @@ def test_a_server_without_a_network_is_wrong_usage() -> None:
 
 
 def test_nothing_listens_but_what_is_named() -> None:
-    configuration = json.loads(Endpoints(("tcp/127.0.0.1:1",), (), False).configuration())
-    assert configuration["listen"]["endpoints"] == []
-    assert not configuration["scouting"]["multicast"]["enabled"]
-    assert not configuration["scouting"]["gossip"]["enabled"]
-    assert "listen" not in json.loads(Endpoints((), (), True).configuration())
+    layout = json.loads(Endpoints(("tcp/127.0.0.1:1",), (), False).layout())
+    assert layout["listen"]["endpoints"] == []
+    assert not layout["scouting"]["multicast"]["enabled"]
+    assert not layout["scouting"]["gossip"]["enabled"]
+    assert "listen" not in json.loads(Endpoints((), (), True).layout())
 
 
 def test_only_one_way_out_and_no_way_in_makes_a_client() -> None:
     def mode(connect: tuple[str, ...], listen: tuple[str, ...]) -> object:
-        return json.loads(Endpoints(connect, listen, False).configuration())["mode"]
+        return json.loads(Endpoints(connect, listen, False).layout())["mode"]
 
     first, second = "tcp/127.0.0.1:1", "tcp/127.0.0.1:2"
     assert mode((first,), ()) == "client"

@@ -44,19 +44,19 @@ def _expert(world: World, steps: int) -> None:
 
 
 def test_the_same_reset_gives_the_same_bytes(world: World, task: Task) -> None:
-    first = _bytes(world.reset(configuration=None, seed=11))
+    first = _bytes(world.reset(layout=None, seed=11))
     _run(world, _actions(5))
-    assert _bytes(world.reset(configuration=None, seed=11)) == first
-    assert _bytes(world.reset(configuration=None, seed=12)) != first
+    assert _bytes(world.reset(layout=None, seed=11)) == first
+    assert _bytes(world.reset(layout=None, seed=12)) != first
     with World(task) as other:
-        assert _bytes(other.reset(configuration=None, seed=11)) == first
+        assert _bytes(other.reset(layout=None, seed=11)) == first
 
 
 def test_what_lies_beyond_the_edges_is_left_out_and_changes_no_pixel(
     world: World, task: Task
 ) -> None:
     model = mujoco.MjModel.from_xml_path(str(task.scene))
-    height, width = world.reset(configuration=1, seed=0).image.shape[:2]
+    height, width = world.reset(layout=1, seed=0).image.shape[:2]
     with mujoco.Renderer(model, height, width) as whole:
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             whole.scene.flags[flag] = 0
@@ -71,7 +71,7 @@ def test_what_lies_beyond_the_edges_is_left_out_and_changes_no_pixel(
 def test_objects_at_rest_sleep_and_the_judge_feels_what_they_touch(
     world: World, task: Task
 ) -> None:
-    world.reset(configuration=3, seed=0)
+    world.reset(layout=3, seed=0)
     source = world.model.body_treeid[world.model.body(task.source).id]
     for _ in range(3):
         world.step(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
@@ -89,7 +89,7 @@ def test_objects_at_rest_sleep_and_the_judge_feels_what_they_touch(
 
 
 def test_save_and_restore_are_exact(world: World, task: Task) -> None:
-    world.reset(configuration=3, seed=0)
+    world.reset(layout=3, seed=0)
     _run(world, _actions(10))
     snapshot = world.save()
     clean = _run(world, _actions(10, seed=1))
@@ -102,7 +102,7 @@ def test_save_and_restore_are_exact(world: World, task: Task) -> None:
 
 
 def test_saving_changes_nothing_while_an_object_is_held(world: World) -> None:
-    world.reset(configuration=0, seed=0)
+    world.reset(layout=0, seed=0)
     _expert(world, 14)
     snapshot = world.save()
     expected = [world.step(world.expert_action()) for _ in range(8)]
@@ -116,7 +116,7 @@ def test_saving_changes_nothing_while_an_object_is_held(world: World) -> None:
 
 
 def test_a_snapshot_of_another_task_or_length_is_refused(world: World, task: Task) -> None:
-    world.reset(configuration=0, seed=0)
+    world.reset(layout=0, seed=0)
     snapshot = world.save()
     with pytest.raises(InvalidSnapshot, match="expected"):
         world.restore(snapshot[:-1])
@@ -125,7 +125,7 @@ def test_a_snapshot_of_another_task_or_length_is_refused(world: World, task: Tas
 
 
 def test_the_episode_ends_at_its_horizon_and_not_before(cube_world: World) -> None:
-    cube_world.reset(configuration=0, seed=0)
+    cube_world.reset(layout=0, seed=0)
     stay = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     ends = [cube_world.step(stay) for _ in range(cube_world.task.steps_max)]
     assert [end.truncated for end in ends] == [False] * (cube_world.task.steps_max - 1) + [True]
@@ -141,7 +141,7 @@ def test_the_episode_ends_at_its_horizon_and_not_before(cube_world: World) -> No
     ids=["short", "nested", "nan", "infinite"],
 )
 def test_a_bad_action_is_refused_and_changes_nothing(cube_world: World, action: np.ndarray) -> None:
-    cube_world.reset(configuration=0, seed=0)
+    cube_world.reset(layout=0, seed=0)
     before = cube_world.save()
     with pytest.raises(InvalidAction, match="expected"):
         cube_world.step(action)
@@ -162,7 +162,7 @@ def test_diverged_physics_is_a_fault_and_a_reset_recovers(
     monkeypatch.chdir(tmp_path)
     task = TASKS["widowx_stack_cube"]
     with World(task) as broken:
-        observation = _bytes(broken.reset(configuration=0, seed=0))
+        observation = _bytes(broken.reset(layout=0, seed=0))
         # Explicit integration of these drives with a long step really diverges.
         broken.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         broken.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
@@ -174,7 +174,7 @@ def test_diverged_physics_is_a_fault_and_a_reset_recovers(
         broken.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         broken.model.opt.disableflags = 0
         broken.model.opt.timestep = task.settings.timestep
-        assert _bytes(broken.reset(configuration=0, seed=0)) == observation
+        assert _bytes(broken.reset(layout=0, seed=0)) == observation
     assert not list(tmp_path.iterdir()), "nothing is written into the working folder"
 
 
@@ -182,7 +182,7 @@ def test_diverged_physics_is_a_fault_and_a_reset_recovers(
 def test_a_source_that_is_lost_is_a_failure_not_a_fault(name: str) -> None:
     task = TASKS[name]
     with World(task, 16, 16) as world:
-        world.reset(configuration=0, seed=0)
+        world.reset(layout=0, seed=0)
         address = world.model.joint(task.source).qposadr[0]
         world.data.qpos[address : address + 3] = [0.6, 0.9, 1.0]
         hold = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
@@ -194,7 +194,7 @@ def test_a_source_that_is_lost_is_a_failure_not_a_fault(name: str) -> None:
 
 def test_a_source_that_spins_is_no_fault(cube_world: World) -> None:
     # Seen at 109 rad/s: what falls off the table and lands on an edge.
-    cube_world.reset(configuration=0, seed=0)
+    cube_world.reset(layout=0, seed=0)
     joint = cube_world.model.joint(cube_world.task.source)
     cube_world.data.qpos[joint.qposadr[0] + 2] += 0.5
     cube_world.data.qvel[joint.dofadr[0] + 3] = 300.0

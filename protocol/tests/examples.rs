@@ -20,7 +20,7 @@ pub fn description() -> Description {
         version: 1,
         instruction: instruction.into(),
         steps_max,
-        configurations: 24,
+        layouts: 24,
         state: vec![dimension("x", 2.0, false), height.clone()],
         action: vec![dimension("x", 0.5, false), dimension("gripper", 1.0, true)],
     };
@@ -94,11 +94,11 @@ pub fn transition() -> Transition {
 }
 
 pub fn requests() -> [(&'static str, Request); 6] {
-    let reset = |sequence, configuration, seed| Request::Reset {
+    let reset = |sequence, layout, seed| Request::Reset {
         sequence,
         task: "widowx_spoon_on_towel".into(),
         variant: "default".into(),
-        configuration,
+        layout,
         seed,
     };
     let action = vec![0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0];
@@ -154,7 +154,7 @@ pub fn outcome() -> EpisodeOutcome {
         run: "evaluation-7".into(),
         task: "widowx_spoon_on_towel".into(),
         variant: "default".into(),
-        configuration: None,
+        layout: None,
         seed: 3_000_000_000,
         episode: 12,
         strategy: "verifier".into(),

@@ -130,8 +130,8 @@ fn structure_cases() -> Vec<Case> {
 fn field_cases() -> Vec<Case> {
     let as_array = vec![0x81, 0xa4, b'S', b'a', b'v', b'e', 0x92, 0x03, 0x00];
     let twice = changed(save(), b"\xa4slot", b"\xa8sequence");
-    let no_configuration =
-        changed(changed(reset(), b"\xadconfiguration\x17", b""), b"\x85\xa8", b"\x84\xa8");
+    let no_layout =
+        changed(changed(reset(), b"\xa6layout\x17", b""), b"\x85\xa8", b"\x84\xa8");
     vec![
         case(
             "unknown_message",
@@ -151,7 +151,7 @@ fn field_cases() -> Vec<Case> {
             vec![0x81, 0xa4, b'S', b'a', b'v', b'e', 0x80],
             "missing field `sequence`",
         ),
-        case("missing_optional", "request", no_configuration, "request cannot be read"),
+        case("missing_optional", "request", no_layout, "request cannot be read"),
         case("field_twice", "request", twice, "duplicate field `sequence`"),
         case("fields_as_array", "request", as_array, "request cannot be read"),
         case("not_a_map", "request", vec![0xc0], "request cannot be read"),

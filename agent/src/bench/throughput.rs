@@ -17,7 +17,7 @@ use crate::servers::LocalServers;
 use crate::site::Site;
 use crate::stop::Stop;
 use crate::strategy::Strategy;
-use crate::suite::{Arm, Placements, SeedRange, Suite, TASKS};
+use crate::suite::{Arm, Layouts, SeedRange, Suite, TASKS};
 use crate::verifier::Verifier;
 use crate::wire::{Network, OutcomePublisher};
 
@@ -62,7 +62,7 @@ pub struct ThroughputBench<'a> {
 }
 
 impl ThroughputBench<'_> {
-    /// Runs episodes on random placements of the tuning range; what they come to is thrown away.
+    /// Runs episodes on random layouts of the tuning range; what they come to is thrown away.
     pub fn run(&self) -> Result<Vec<Row>> {
         ensure!(self.decisions > 0, "decisions: expected at least 1, got 0");
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
@@ -130,7 +130,7 @@ impl ThroughputBench<'_> {
         let suite = Suite {
             tasks: TASKS.map(str::to_owned).to_vec(),
             episodes: episodes.div_ceil(TASKS.len()) as u32,
-            placements: Placements::Random,
+            layouts: Layouts::Random,
             range: SeedRange::Tuning,
             seed: 0,
         };

@@ -221,7 +221,7 @@ pub(super) async fn reset(environments: Vec<Environment>) -> Result<Vec<Episode>
         let reset = Reset {
             task: TASKS[index % TASKS.len()].to_owned(),
             variant: VARIANT_DEFAULT.to_owned(),
-            configuration: None,
+            layout: None,
             seed: SeedRange::Tuning.first() + index as u64,
         };
         environment.reset(reset)

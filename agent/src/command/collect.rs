@@ -8,9 +8,9 @@ use clap::Args;
 use super::episodes::EpisodesArguments;
 use super::evaluate::{show, temperature};
 use crate::strategy::Strategy;
-use crate::suite::{Arm, Placements, SeedRange, Suite};
+use crate::suite::{Arm, Layouts, SeedRange, Suite};
 
-/// Runs sampled episodes on random placements that evaluation never sees, and keeps them as labels.
+/// Runs sampled episodes on random layouts that evaluation never sees, and keeps them as labels.
 #[derive(Debug, Clone, Args)]
 pub struct Arguments {
     #[command(flatten)]
@@ -37,7 +37,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let suite = Suite {
         tasks: arguments.episodes_arguments.tasks.clone(),
         episodes: arguments.episodes,
-        placements: Placements::Random,
+        layouts: Layouts::Random,
         range: SeedRange::Collection,
         seed: arguments.episodes_arguments.seed,
     };

@@ -14,7 +14,7 @@ use crate::result_file::ResultFile;
 use crate::rollout::Keep;
 use crate::site::Site;
 use crate::strategy::Strategy;
-use crate::suite::{Arm, Placements, SeedRange, Suite, TASKS};
+use crate::suite::{Arm, Layouts, SeedRange, Suite, TASKS};
 use crate::table;
 
 /// Environment servers: one per core of a small machine.
@@ -30,10 +30,10 @@ const TEMPERATURE: f32 = 1.0;
 /// Runs the four tasks with one sample and with the verifier's choice, then builds a report with videos.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Random placements of each task; each is run with one sample and with the verifier
+    /// Random layouts of each task; each is run with one sample and with the verifier
     #[arg(long, default_value_t = 6)]
     episodes: u32,
-    /// Another number gives other placements
+    /// Another number gives other layouts
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// The run's folder; the same command goes on where it was [default: runs/demo-…]
@@ -52,7 +52,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let started = Instant::now();
     let campaign = campaign(&arguments)?;
     println!(
-        "{} placements of {} tasks, each with one sample and with the verifier's choice of {CANDIDATES}",
+        "{} layouts of {} tasks, each with one sample and with the verifier's choice of {CANDIDATES}",
         arguments.episodes,
         TASKS.len()
     );
@@ -76,7 +76,7 @@ fn campaign(arguments: &Arguments) -> Result<Campaign> {
         suite: Suite {
             tasks: TASKS.map(str::to_owned).to_vec(),
             episodes: arguments.episodes,
-            placements: Placements::Random,
+            layouts: Layouts::Random,
             range: SeedRange::Evaluation,
             seed: arguments.seed,
         },

@@ -198,7 +198,7 @@ async fn try_world(
     let reset = Reset {
         task: task.to_owned(),
         variant: VARIANT_DEFAULT.to_owned(),
-        configuration: None,
+        layout: None,
         seed: SeedRange::Tuning.first(),
     };
     let mut episode = environment.reset(reset).await?;

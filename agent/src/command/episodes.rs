@@ -22,7 +22,7 @@ pub struct EpisodesArguments {
     /// Tasks, separated by commas; all four by default.
     #[arg(long, value_delimiter = ',', default_values_t = TASKS.map(str::to_owned))]
     pub tasks: Vec<String>,
-    /// Another number gives other placements and other samples.
+    /// Another number gives other layouts and other samples.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
     /// The checkpoint's folder [default: the one that comes with rever].

@@ -9,7 +9,7 @@ use super::episodes::EpisodesArguments;
 use crate::campaign::Report;
 use crate::result_file::ResultFile;
 use crate::strategy::Strategy;
-use crate::suite::{Arm, CONFIGURATIONS, Placements, SeedRange, Suite};
+use crate::suite::{Arm, LAYOUTS, Layouts, SeedRange, Suite};
 use crate::table;
 
 /// Measures strategies on the same paired episodes; started again it goes on where it was.
@@ -21,11 +21,11 @@ pub struct Arguments {
     #[arg(long, value_delimiter = ',', default_value = "greedy,sample,verifier")]
     strategies: Vec<Strategy>,
     /// Episodes of each task.
-    #[arg(long, default_value_t = CONFIGURATIONS)]
+    #[arg(long, default_value_t = LAYOUTS)]
     episodes: u32,
-    /// The 24 configurations of each task, or random placements from the held-out range.
+    /// The 24 layouts of each task, or random layouts from the held-out range.
     #[arg(long, value_enum, default_value = "grid")]
-    placements: Placements,
+    layouts: Layouts,
     /// Candidates per step; several, separated by commas, give success against N.
     #[arg(long, value_delimiter = ',', default_value = "5", value_parser = clap::value_parser!(u32).range(1..=256))]
     candidates: Vec<u32>,
@@ -42,7 +42,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let suite = Suite {
         tasks: arguments.episodes_arguments.tasks.clone(),
         episodes: arguments.episodes,
-        placements: arguments.placements,
+        layouts: arguments.layouts,
         range: SeedRange::Evaluation,
         seed: arguments.episodes_arguments.seed,
     };

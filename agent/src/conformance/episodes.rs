@@ -33,7 +33,7 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row(
             "reset_task",
-            "a Reset to a task or a configuration that is not offered is refused",
+            "a Reset to a task or a layout that is not offered is refused",
             reset_task(subject),
         )
         .await;
@@ -52,7 +52,7 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
         )
         .await;
     table
-        .row("seeds", "another seed gives another placement", async {
+        .row("seeds", "another seed gives another layout", async {
             let mut talk = subject.talk().await?;
             let first = talk.reset(0).await?;
             let second = talk.reset(1).await?;
@@ -111,14 +111,14 @@ async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
             sequence,
             task: "no_such_task".to_owned(),
             variant,
-            configuration: None,
+            layout: None,
             seed: 0,
         })
         .await?;
     names(&reason, &["no_such_task"])?;
-    let beyond = subject.task().configurations;
+    let beyond = subject.task().layouts;
     let request = talk.resetting(Some(beyond), 0);
-    names(&talk.refused(request).await?, &["configuration", &beyond.to_string()])?;
+    names(&talk.refused(request).await?, &["layout", &beyond.to_string()])?;
     // Refused: the world is unchanged, and the episode goes on.
     talk.hold_still().await?;
     talk.save(0).await?;
@@ -128,10 +128,10 @@ async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
     talk.restore(0).await?;
     let mut others = subject.description.tasks.iter();
     if let Some(other) = others.find(|other| other.task != subject.task().task) {
-        let TaskDescription { task, variant, configurations, .. } = other.clone();
-        let configuration = Some(configurations);
-        let reset = |sequence| Request::Reset { sequence, task, variant, configuration, seed: 0 };
-        names(&talk.refused(reset).await?, &["configuration"])?;
+        let TaskDescription { task, variant, layouts, .. } = other.clone();
+        let layout = Some(layouts);
+        let reset = |sequence| Request::Reset { sequence, task, variant, layout, seed: 0 };
+        names(&talk.refused(reset).await?, &["layout"])?;
         equal(&[expected], &[stepped(talk.go().await?)])?;
         talk.restore(0).await?;
     }

@@ -206,7 +206,7 @@ impl Talk {
         }
     }
 
-    /// Begins an episode on a random placement.
+    /// Begins an episode on a random layout.
     pub async fn reset(&mut self, index: u64) -> Result<Observation> {
         let request = self.resetting(None, SeedRange::Tuning.first() + index);
         match self.ask(request).await? {
@@ -218,11 +218,11 @@ impl Talk {
     /// A `Reset` of the task under test.
     pub fn resetting(
         &self,
-        configuration: Option<u32>,
+        layout: Option<u32>,
         seed: u64,
     ) -> impl FnOnce(u64) -> Request + use<> {
         let (task, variant) = (self.task.task.clone(), self.task.variant.clone());
-        move |sequence| Request::Reset { sequence, task, variant, configuration, seed }
+        move |sequence| Request::Reset { sequence, task, variant, layout, seed }
     }
 
     /// Steps with an action that does little.

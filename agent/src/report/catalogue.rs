@@ -18,10 +18,10 @@ pub struct Catalogue {
 #[derive(Serialize)]
 pub struct Entry {
     pub id: String,
-    /// Entries with the same number are one placement under different arms.
+    /// Entries with the same number are one layout under different arms.
     pub pair: usize,
     pub task: String,
-    pub placement: String,
+    pub layout: String,
     pub strategy: String,
     pub candidates: u32,
     pub temperature: f32,
@@ -49,8 +49,8 @@ impl Catalogue {
             episodes.push(Entry {
                 pair: *pairs.entry(place).or_insert(count),
                 task: task_words(&identity.task),
-                placement: match identity.configuration {
-                    Some(configuration) => format!("grid {configuration}"),
+                layout: match identity.layout {
+                    Some(layout) => format!("grid {layout}"),
                     None => format!("random {}", identity.episode),
                 },
                 strategy: identity.strategy.clone(),
@@ -79,7 +79,7 @@ pub fn task_words(task: &str) -> String {
     name.strip_prefix("put_").unwrap_or(name).replace('_', " ")
 }
 
-/// Placements in order of their numbers, the arms of one placement together.
+/// Layouts in order of their numbers, the arms of one layout together.
 fn in_order(summaries: &[EpisodeSummary]) -> Vec<&EpisodeSummary> {
     let mut ordered: Vec<&EpisodeSummary> = summaries.iter().collect();
     ordered.sort_by(|a, b| {
@@ -103,7 +103,7 @@ fn grant_details(episodes: &mut [Entry], details_max: usize) {
     }
 }
 
-/// How many placements of the same task come before this one.
+/// How many layouts of the same task come before this one.
 fn place_in_task(episodes: &[Entry], index: usize) -> usize {
     let first = episodes.iter().position(|entry| entry.task == episodes[index].task);
     episodes[index].pair - first.map_or(0, |first| episodes[first].pair)
@@ -135,7 +135,7 @@ mod tests {
         assert!(catalogue.detailed().contains(with_video.as_str()));
         for one in &catalogue.episodes {
             for other in &catalogue.episodes {
-                let same = (&one.task, &one.placement) == (&other.task, &other.placement);
+                let same = (&one.task, &one.layout) == (&other.task, &other.layout);
                 assert_eq!(same, one.pair == other.pair, "{} and {}", one.id, other.id);
             }
         }

@@ -86,7 +86,7 @@ fn identity(task: &str, episode: u32, strategy: &str, candidates: u32) -> Episod
         run: "made-up".into(),
         task: task.into(),
         variant: "default".into(),
-        configuration: (episode > 2).then_some(episode),
+        layout: (episode > 2).then_some(episode),
         episode,
         seed: 3_000_000_000 + u64::from(episode),
         sampling_seed: u64::from(episode),

@@ -204,7 +204,7 @@ fn gains(results: &Results) -> String {
         ),
     };
     format!(
-        "<p class=\"note\">Points of success on the same placements with the same random numbers, \
+        "<p class=\"note\">Points of success on the same layouts with the same random numbers, \
          averaged over tasks; 95 % paired bootstrap intervals.</p>{figure}{headroom}"
     )
 }

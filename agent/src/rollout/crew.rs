@@ -285,7 +285,7 @@ mod tests {
             version,
             instruction: String::new(),
             steps_max: 1,
-            configurations: 0,
+            layouts: 0,
             state: Vec::new(),
             action: Vec::new(),
         };

@@ -206,7 +206,7 @@ fn reset(identity: &EpisodeIdentity) -> Reset {
     Reset {
         task: identity.task.clone(),
         variant: identity.variant.clone(),
-        configuration: identity.configuration,
+        layout: identity.layout,
         seed: identity.seed,
     }
 }

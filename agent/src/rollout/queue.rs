@@ -81,7 +81,7 @@ fn identity(run: &str, plan: &EpisodePlan, arm: Arm) -> EpisodeIdentity {
         run: run.to_owned(),
         task: plan.task.clone(),
         variant: plan.variant.clone(),
-        configuration: plan.configuration,
+        layout: plan.layout,
         episode: plan.episode,
         seed: plan.seed,
         sampling_seed: plan.sampling_seed,
@@ -95,13 +95,13 @@ fn identity(run: &str, plan: &EpisodePlan, arm: Arm) -> EpisodeIdentity {
 mod tests {
     use super::*;
     use crate::strategy::Strategy;
-    use crate::suite::{Placements, SeedRange, Suite};
+    use crate::suite::{Layouts, SeedRange, Suite};
 
     fn queue(recorded: &[&str]) -> Queue {
         let suite = Suite {
             tasks: vec!["a".into(), "b".into()],
             episodes: 2,
-            placements: Placements::Grid,
+            layouts: Layouts::Grid,
             range: SeedRange::Evaluation,
             seed: 0,
         };

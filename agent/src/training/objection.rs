@@ -10,8 +10,8 @@ use crate::suite::SeedRange;
 /// Why an episode must not teach the verifier of a policy.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Objection {
-    /// Its placement is one of those kept for evaluation.
-    Configuration(u32),
+    /// Its layout is one of those kept for evaluation.
+    Layout(u32),
     /// Its scene is not one of those for collection.
     Seed(u64),
     /// Its candidates were not sampled.
@@ -28,7 +28,7 @@ impl Objection {
     /// The reason in few words, the same for all episodes that it holds for.
     pub fn reason(&self) -> &'static str {
         match self {
-            Objection::Configuration(_) => "placement of the evaluation",
+            Objection::Layout(_) => "layout of the evaluation",
             Objection::Seed(_) => "seed outside of the collection range",
             Objection::Temperature(_) => "greedy",
             Objection::Strategy(_) => "chosen by the expert",
@@ -42,8 +42,8 @@ impl fmt::Display for Objection {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let first = SeedRange::Collection.first();
         match self {
-            Objection::Configuration(configuration) => {
-                write!(formatter, "expected a random placement, got configuration {configuration}")
+            Objection::Layout(layout) => {
+                write!(formatter, "expected a random layout, got layout {layout}")
             }
             Objection::Seed(seed) => {
                 write!(
@@ -78,8 +78,8 @@ impl std::error::Error for Objection {}
 /// Whether an episode may teach the verifier of the policy with this digest.
 pub fn object(outcome: &EpisodeOutcome, policy: &str) -> Option<Objection> {
     let with_expert = |strategy: &str| strategy.parse().map_or(true, Strategy::needs_expert);
-    if let Some(configuration) = outcome.configuration {
-        Some(Objection::Configuration(configuration))
+    if let Some(layout) = outcome.layout {
+        Some(Objection::Layout(layout))
     } else if !SeedRange::Collection.contains(outcome.seed) {
         Some(Objection::Seed(outcome.seed))
     } else if outcome.temperature <= 0.0 {

@@ -187,7 +187,7 @@ mod tests {
                 run: "run-1".to_owned(),
                 task: "widowx_stack_cube".to_owned(),
                 variant: "default".to_owned(),
-                configuration: None,
+                layout: None,
                 episode,
                 seed: SeedRange::Collection.first() + u64::from(episode),
                 sampling_seed: 5,
@@ -259,8 +259,8 @@ mod tests {
             assert_eq!(error.to_string(), expected);
         };
         check(
-            |record| record.identity.configuration = Some(7),
-            "expected a random placement, got configuration 7",
+            |record| record.identity.layout = Some(7),
+            "expected a random layout, got layout 7",
         );
         check(
             |record| record.identity.seed = SeedRange::Evaluation.first(),
@@ -293,7 +293,7 @@ mod tests {
         write(folder.path(), &[record(0), record(1)]);
         assert_eq!(from_runs(&runs, CAFE).expect("two episodes").len(), 2);
         let mut bad = record(2);
-        bad.identity.configuration = Some(7);
+        bad.identity.layout = Some(7);
         write(folder.path(), &[bad]);
         let error = format!("{:#}", from_runs(&runs, CAFE).expect_err("one is bad"));
         assert!(

@@ -53,7 +53,7 @@ pub struct Metrics {
 /// AUROC in three views; `None` where a class is missing.
 ///
 /// The pooled value misleads: knowing which task is easy already raises it, and that chooses nothing among the candidates
-/// of one step. The macro average is free of that, yet it still rewards recognising an easy placement.
+/// of one step. The macro average is free of that, yet it still rewards recognising an easy layout.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Discrimination {

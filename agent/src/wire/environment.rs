@@ -107,8 +107,8 @@ impl Environment {
 
     /// Starts an episode. An error gives the session up: open another one.
     pub async fn reset(mut self, reset: Reset) -> Result<Episode, EnvironmentFault> {
-        let Reset { task, variant, configuration, seed } = reset;
-        let request = |sequence| Request::Reset { sequence, task, variant, configuration, seed };
+        let Reset { task, variant, layout, seed } = reset;
+        let request = |sequence| Request::Reset { sequence, task, variant, layout, seed };
         match self.ask("Reset", request).await? {
             Reply::Observed { observation, .. } => Episode::new(self, observation),
             other => Err(unexpected("Observed", &other)),

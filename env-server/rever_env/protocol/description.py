@@ -32,14 +32,14 @@ class Dimension:
 
 @dataclass(frozen=True)
 class TaskDescription:
-    """One task in one variant. configurations: how many fixed ones there are."""
+    """One task in one variant. layouts: how many fixed ones there are."""
 
     task: str
     variant: str
     version: U32
     instruction: str
     steps_max: U32
-    configurations: U32
+    layouts: U32
     state: tuple[Dimension, ...]
     action: tuple[Dimension, ...]
 

@@ -14,7 +14,7 @@ class EpisodeOutcome:
     run: str
     task: str
     variant: str
-    configuration: U32 | None
+    layout: U32 | None
     seed: int
     episode: U32
     strategy: str

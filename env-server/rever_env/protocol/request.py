@@ -15,12 +15,12 @@ from rever_env.protocol.value import U32, Numbered
 
 @dataclass(frozen=True)
 class Reset(Numbered):
-    """Starts an episode; ends the one before. configuration None draws from the seed."""
+    """Starts an episode; ends the one before. layout None draws from the seed."""
 
     sequence: int
     task: str
     variant: str
-    configuration: U32 | None
+    layout: U32 | None
     seed: int
 
     def validate(self) -> None:

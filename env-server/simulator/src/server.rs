@@ -198,7 +198,7 @@ impl<'a> Server<'a> {
             version: task.rule.version,
             instruction: task.rule.instruction.clone(),
             steps_max: task.rule.steps_max,
-            configurations: task.rule.grid.configurations.len() as u32,
+            layouts: task.rule.grid.layouts.len() as u32,
             state: task.state.clone(),
             action: task.action.clone(),
         });

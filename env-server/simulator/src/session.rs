@@ -104,10 +104,10 @@ impl Session {
             return Err(Fault::Wrong(format!("expected nothing after Close, got {name}")));
         }
         let request = match request {
-            Request::Reset { sequence, task, variant, configuration, seed } => {
+            Request::Reset { sequence, task, variant, layout, seed } => {
                 worlds.task(&task, &variant)?;
                 let key = key(&self.opened, &task, &variant);
-                let observation = self.reset(key, configuration, seed, worlds)?;
+                let observation = self.reset(key, layout, seed, worlds)?;
                 self.slots.clear();
                 self.is_running = true;
                 self.last_image = Some(observation.image.clone());
@@ -162,15 +162,15 @@ impl Session {
     fn reset(
         &mut self,
         key: Key,
-        configuration: Option<u32>,
+        layout: Option<u32>,
         seed: u64,
         worlds: &mut Worlds,
     ) -> Result<Observation, Fault> {
         if let Some((_, world)) = self.world.as_mut().filter(|(current, _)| *current == key) {
-            return world.reset(configuration, seed);
+            return world.reset(layout, seed);
         }
         let mut world = worlds.take(&key)?;
-        let observation = world.reset(configuration, seed);
+        let observation = world.reset(layout, seed);
         if observation.as_ref().is_err_and(|fault| fault.kind().is_none()) {
             worlds.give_back(key, world);
             return observation;

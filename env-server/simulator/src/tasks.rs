@@ -16,7 +16,7 @@ pub const STATE_LENGTH: usize = 8;
 /// Where source and target start: metres in the world frame, yaw in degrees.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(from = "[f64; 5]")]
-pub struct Placement {
+pub struct Layout {
     pub source_x: f64,
     pub source_y: f64,
     pub source_yaw: f64,
@@ -24,7 +24,7 @@ pub struct Placement {
     pub target_y: f64,
 }
 
-/// The box random placements are drawn from, and what is kept out of it.
+/// The box random layouts are drawn from, and what is kept out of it.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RandomRanges {
@@ -130,11 +130,11 @@ pub struct TaskRule {
     pub grid: Grid,
 }
 
-/// The fixed placements.
+/// The fixed layouts.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Grid {
-    pub configurations: Vec<Placement>,
+    pub layouts: Vec<Layout>,
 }
 
 #[derive(Deserialize)]
@@ -162,9 +162,9 @@ impl From<Bounds> for Dimension {
     }
 }
 
-impl From<[f64; 5]> for Placement {
-    fn from([source_x, source_y, source_yaw, target_x, target_y]: [f64; 5]) -> Placement {
-        Placement { source_x, source_y, source_yaw, target_x, target_y }
+impl From<[f64; 5]> for Layout {
+    fn from([source_x, source_y, source_yaw, target_x, target_y]: [f64; 5]) -> Layout {
+        Layout { source_x, source_y, source_yaw, target_x, target_y }
     }
 }
 

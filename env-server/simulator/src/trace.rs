@@ -20,7 +20,7 @@ pub struct Arguments {
     task: String,
     /// Drawn from the seed if left out.
     #[arg(long)]
-    configuration: Option<u32>,
+    layout: Option<u32>,
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Height and width of the image.
@@ -50,7 +50,7 @@ pub fn trace(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
     let task = task.with_context(|| format!("there is no task {}", arguments.task))?;
     let mut actions = arguments.actions.map(read).transpose()?.map(Vec::into_iter);
     let mut world = World::new(&Arc::new(task), arguments.side, arguments.side)?;
-    let observation = world.reset(arguments.configuration, arguments.seed)?;
+    let observation = world.reset(arguments.layout, arguments.seed)?;
     print(&world, &observation, None)?;
     loop {
         let action = match &mut actions {

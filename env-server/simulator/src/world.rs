@@ -12,9 +12,9 @@ use crate::controller::{ARM_JOINTS, Controller, Pose};
 use crate::expert::{self, Sight};
 use crate::fault::Fault;
 use crate::model::{self, Names, Vector};
-use crate::placement::place;
+use crate::layout::place;
 use crate::success::{Judge, Memory};
-use crate::tasks::{ACTION_LENGTH, Placement, STATE_LENGTH, Task};
+use crate::tasks::{ACTION_LENGTH, Layout, STATE_LENGTH, Task};
 
 /// Objects start this far above rest, metres.
 const START_GAP: f64 = 0.002;
@@ -76,14 +76,14 @@ impl World {
     }
 
     /// Places and settles the objects; the same arguments give the same bytes.
-    pub fn reset(&mut self, configuration: Option<u32>, seed: u64) -> Result<Observation, Fault> {
-        let placement = place(&self.task, configuration, seed)?;
+    pub fn reset(&mut self, layout: Option<u32>, seed: u64) -> Result<Observation, Fault> {
+        let layout = place(&self.task, layout, seed)?;
         self.data.reset();
         self.episode = None;
         let joints = self.task.rule.robot_joints;
         self.data.qpos_mut()[..joints.len()].copy_from_slice(&joints);
         self.data.ctrl_mut().copy_from_slice(&joints);
-        self.place_objects(&placement);
+        self.place_objects(&layout);
         self.settle()?;
         self.controller.reset(&self.data);
         self.episode = Some(Episode { memory: self.judge.begin(&self.data), steps: 0 });
@@ -182,12 +182,12 @@ impl World {
         Ok(self.judge.judge(&self.data, &mut episode.memory))
     }
 
-    fn place_objects(&mut self, placement: &Placement) {
+    fn place_objects(&mut self, layout: &Layout) {
         let rule = &self.task.rule;
-        let source = [placement.source_x, placement.source_y, rule.source_height];
-        let mut rows = vec![(self.names.source_joint, source, placement.source_yaw)];
+        let source = [layout.source_x, layout.source_y, rule.source_height];
+        let mut rows = vec![(self.names.source_joint, source, layout.source_yaw)];
         if let (Some(joint), Some(height)) = (self.names.target_joint, rule.target_height) {
-            rows.push((joint, [placement.target_x, placement.target_y, height], 0.0));
+            rows.push((joint, [layout.target_x, layout.target_y, height], 0.0));
         }
         for (joint, [x, y, height], yaw) in rows {
             let start = self.data.model().jnt_qposadr()[joint] as usize;

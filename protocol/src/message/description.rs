@@ -39,8 +39,8 @@ pub struct TaskDescription {
     pub instruction: String,
     /// Steps after which an episode is truncated.
     pub steps_max: u32,
-    /// Fixed configurations, numbered from 0; the random ones lie beside them.
-    pub configurations: u32,
+    /// Fixed layouts, numbered from 0; the random ones lie beside them.
+    pub layouts: u32,
     /// What the numbers of a state are.
     pub state: Vec<Dimension>,
     /// What the numbers of an action are.

@@ -16,9 +16,9 @@ pub struct EpisodeOutcome {
     pub task: String,
     /// `default`, or what is changed.
     pub variant: String,
-    /// One of the fixed configurations; none: a random placement.
-    pub configuration: Option<u32>,
-    /// Of the placement.
+    /// One of the fixed layouts; none: a random layout.
+    pub layout: Option<u32>,
+    /// Of the layout.
     pub seed: u64,
     /// Number of the episode within task and variant.
     pub episode: u32,

@@ -13,8 +13,8 @@ pub struct Reset {
     pub task: String,
     /// `default`, or what is changed.
     pub variant: String,
-    /// One of the fixed configurations; none draws a placement from the seed.
-    pub configuration: Option<u32>,
+    /// One of the fixed layouts; none draws a layout from the seed.
+    pub layout: Option<u32>,
     /// Below 2^53.
     pub seed: u64,
 }
@@ -33,8 +33,8 @@ pub enum Request {
         task: String,
         /// `default`, or what is changed.
         variant: String,
-        /// One of the fixed configurations; none draws a placement from the seed.
-        configuration: Option<u32>,
+        /// One of the fixed layouts; none draws a layout from the seed.
+        layout: Option<u32>,
         /// Below 2^53.
         seed: u64,
     },

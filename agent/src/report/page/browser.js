@@ -50,7 +50,7 @@
     const made = element("li", entry === current ? "current" : "");
     const text = element("div", "", entry.task);
     text.append(element("br"), element("span", "where", name(entry)));
-    const right = element("div", "right", entry.placement);
+    const right = element("div", "right", entry.layout);
     right.append(element("br"), `${entry.steps} steps`);
     made.append(element("span", `mark ${entry.outcome}`, MARKS[entry.outcome]), text, right);
     made.addEventListener("click", () => open(entry, 0));
@@ -63,7 +63,7 @@
       ...siblings.map((entry) => {
         const button = element("button", entry === current ? "current" : "", `${MARKS[entry.outcome]} ${name(entry)}`);
         button.type = "button";
-        button.title = "the same placement with this strategy";
+        button.title = "the same layout with this strategy";
         button.addEventListener("click", () => open(entry, frame));
         return button;
       }),
@@ -76,7 +76,7 @@
     wanted = atFrame;
     video.pause();
     drawList();
-    byId("episode-title").textContent = `${entry.task} · ${entry.placement} · ${name(entry)}`;
+    byId("episode-title").textContent = `${entry.task} · ${entry.layout} · ${name(entry)}`;
     drawSiblings();
     byId("no-video").hidden = entry.video;
     video.hidden = !entry.video;

@@ -1,12 +1,12 @@
-"""Placements: the 24 configurations of the published table, and random ones clear of them."""
+"""Layouts: the 24 layouts of the published table, and random ones clear of them."""
 
 import itertools
 
 import pytest
 
-from rever_env.fault import InvalidPlacement
-from rever_env.placement import SEED_LIMIT, SplitMix64, near_configuration, place
-from rever_env.tasks import Placement, Task
+from rever_env.fault import InvalidReset
+from rever_env.layout import SEED_LIMIT, SplitMix64, near_grid_layout, place
+from rever_env.tasks import Layout, Task
 
 
 def _table(name: str) -> list[tuple[float, float, float, float, float]]:
@@ -31,36 +31,36 @@ def _table(name: str) -> list[tuple[float, float, float, float, float]]:
     return rows
 
 
-def test_the_24_configurations_equal_the_published_table(task: Task) -> None:
-    assert len(task.configurations) == 24
-    for configuration, expected in enumerate(_table(task.name)):
-        got = place(task, configuration, seed=0)
+def test_the_24_layouts_equal_the_published_table(task: Task) -> None:
+    assert len(task.layouts) == 24
+    for layout, expected in enumerate(_table(task.name)):
+        got = place(task, layout, seed=0)
         values = (got.source_x, got.source_y, got.source_yaw, got.target_x, got.target_y)
-        assert values == pytest.approx(expected, abs=1e-9), configuration
+        assert values == pytest.approx(expected, abs=1e-9), layout
 
 
 def test_random_placements_stay_in_range_and_clear_of_the_grid(task: Task) -> None:
     ranges = task.random
     for seed in range(3000):
         drawn = place(task, None, seed)
-        assert not near_configuration(task, drawn)
+        assert not near_grid_layout(task, drawn)
         assert ranges.source_x[0] <= drawn.source_x <= ranges.source_x[1]
         assert ranges.source_y[0] <= drawn.source_y <= ranges.source_y[1]
         assert ranges.source_yaw[0] <= drawn.source_yaw <= ranges.source_yaw[1]
         assert ranges.target_x[0] <= drawn.target_x <= ranges.target_x[1]
 
 
-def test_the_neighbourhood_of_every_configuration_is_excluded(task: Task) -> None:
+def test_the_neighbourhood_of_every_layout_is_excluded(task: Task) -> None:
     radius, yaw = task.random.exclusion_radius, task.random.exclusion_yaw
-    for grid in task.configurations:
-        inside = Placement(
+    for grid in task.layouts:
+        inside = Layout(
             grid.source_x + 0.9 * radius,
             grid.source_y,
             grid.source_yaw + 360.0 - 0.9 * yaw,
             grid.target_x,
             grid.target_y - 0.9 * radius,
         )
-        assert near_configuration(task, inside)
+        assert near_grid_layout(task, inside)
 
 
 def test_the_generator_gives_the_published_numbers() -> None:
@@ -81,9 +81,9 @@ def test_tasks_do_not_share_draws() -> None:
     assert len(set(draws)) == len(draws)
 
 
-@pytest.mark.parametrize(("configuration", "seed"), [(24, 0), (-1, 0), (None, -1), (0, SEED_LIMIT)])
+@pytest.mark.parametrize(("layout", "seed"), [(24, 0), (-1, 0), (None, -1), (0, SEED_LIMIT)])
 def test_out_of_range_placements_are_refused(
-    task: Task, configuration: int | None, seed: int
+    task: Task, layout: int | None, seed: int
 ) -> None:
-    with pytest.raises(InvalidPlacement, match="expected"):
-        place(task, configuration, seed)
+    with pytest.raises(InvalidReset, match="expected"):
+        place(task, layout, seed)

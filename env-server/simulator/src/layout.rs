@@ -1,9 +1,9 @@
-//! Placements: the 24 configurations, and random ones that stay clear of them.
+//! Initial layouts: the 24 of the published grid, and random ones that stay clear of them.
 
 use protocol::limits::SEED_END;
 
 use crate::fault::Fault;
-use crate::tasks::{Placement, Task};
+use crate::tasks::{Layout, Task};
 
 const DRAWS_MAX: usize = 10_000;
 
@@ -27,27 +27,27 @@ impl SplitMix64 {
     }
 }
 
-/// The placement of one reset: a grid configuration, or a draw from the seed.
-pub fn place(task: &Task, configuration: Option<u32>, seed: u64) -> Result<Placement, Fault> {
+/// The layout of one reset: a grid layout, or a draw from the seed.
+pub fn place(task: &Task, layout: Option<u32>, seed: u64) -> Result<Layout, Fault> {
     if seed >= SEED_END {
         return Err(Fault::Wrong(format!("seed {seed}: expected 0 <= seed < 2^53")));
     }
-    let Some(configuration) = configuration else { return draw(task, seed) };
-    let configurations = &task.rule.grid.configurations;
-    configurations.get(configuration as usize).copied().ok_or_else(|| {
+    let Some(layout) = layout else { return draw(task, seed) };
+    let layouts = &task.rule.grid.layouts;
+    layouts.get(layout as usize).copied().ok_or_else(|| {
         Fault::Wrong(format!(
-            "configuration {configuration}: expected 0 <= configuration < {} for task {}",
-            configurations.len(),
+            "layout {layout}: expected 0 <= layout < {} for task {}",
+            layouts.len(),
             task.name
         ))
     })
 }
 
-fn draw(task: &Task, seed: u64) -> Result<Placement, Fault> {
+fn draw(task: &Task, seed: u64) -> Result<Layout, Fault> {
     let ranges = &task.rule.random;
     let mut generator = SplitMix64 { state: fnv1a(&task.name) ^ seed };
     for _ in 0..DRAWS_MAX {
-        let placement = Placement {
+        let layout = Layout {
             source_x: generator.uniform(ranges.source_x),
             source_y: generator.uniform(ranges.source_y),
             source_yaw: generator.uniform(ranges.source_yaw),
@@ -55,28 +55,28 @@ fn draw(task: &Task, seed: u64) -> Result<Placement, Fault> {
             target_y: generator.uniform(ranges.target_y),
         };
         let apart = distance(
-            placement.source_x - placement.target_x,
-            placement.source_y - placement.target_y,
+            layout.source_x - layout.target_x,
+            layout.source_y - layout.target_y,
         );
-        if apart >= ranges.separation_min && !is_near_configuration(task, &placement) {
-            return Ok(placement);
+        if apart >= ranges.separation_min && !is_near_grid_layout(task, &layout) {
+            return Ok(layout);
         }
     }
     Err(Fault::Wrong(format!(
-        "task {}, seed {seed}: no free placement in {DRAWS_MAX} draws",
+        "task {}, seed {seed}: no free layout in {DRAWS_MAX} draws",
         task.name
     )))
 }
 
-/// Whether source, target and yaw are all within the excluded distance of one configuration.
-fn is_near_configuration(task: &Task, placement: &Placement) -> bool {
+/// Whether source, target and yaw are all within the excluded distance of one layout.
+fn is_near_grid_layout(task: &Task, layout: &Layout) -> bool {
     let ranges = &task.rule.random;
     let radius = ranges.exclusion_radius;
-    task.rule.grid.configurations.iter().any(|grid| {
-        distance(placement.source_x - grid.source_x, placement.source_y - grid.source_y) <= radius
-            && distance(placement.target_x - grid.target_x, placement.target_y - grid.target_y)
+    task.rule.grid.layouts.iter().any(|grid| {
+        distance(layout.source_x - grid.source_x, layout.source_y - grid.source_y) <= radius
+            && distance(layout.target_x - grid.target_x, layout.target_y - grid.target_y)
                 <= radius
-            && turn(placement.source_yaw - grid.source_yaw) <= ranges.exclusion_yaw
+            && turn(layout.source_yaw - grid.source_yaw) <= ranges.exclusion_yaw
     })
 }
 

@@ -1,10 +1,10 @@
-"""Placements: the 24 configurations, and random ones that stay clear of them."""
+"""Initial layouts: the 24 of the published grid, and random ones that stay clear of them."""
 
 import math
 from dataclasses import dataclass
 
-from rever_env.fault import InvalidPlacement
-from rever_env.tasks import Placement, Task
+from rever_env.fault import InvalidReset
+from rever_env.tasks import Layout, Task
 
 _MASK = (1 << 64) - 1
 _DRAWS_MAX = 10_000
@@ -29,44 +29,44 @@ class SplitMix64:
         return low + (high - low) * ((self.next_word() >> 11) * 2.0**-53)
 
 
-def place(task: Task, configuration: int | None, seed: int) -> Placement:
-    """The placement of one reset: a grid configuration, or a draw from the seed."""
+def place(task: Task, layout: int | None, seed: int) -> Layout:
+    """The layout of one reset: a grid layout, or a draw from the seed."""
     if not 0 <= seed < SEED_LIMIT:
-        raise InvalidPlacement(f"seed {seed}: expected 0 <= seed < 2^53")
-    check_configuration(task.name, configuration, len(task.configurations))
-    return _draw(task, seed) if configuration is None else task.configurations[configuration]
+        raise InvalidReset(f"seed {seed}: expected 0 <= seed < 2^53")
+    check_layout(task.name, layout, len(task.layouts))
+    return _draw(task, seed) if layout is None else task.layouts[layout]
 
 
-def check_configuration(task: str, configuration: int | None, count: int) -> None:
-    """InvalidPlacement for a configuration beyond the task's count; None is a random placement."""
-    if configuration is not None and not 0 <= configuration < count:
-        raise InvalidPlacement(
-            f"configuration {configuration}: expected 0 <= configuration < {count} for task {task}"
+def check_layout(task: str, layout: int | None, count: int) -> None:
+    """InvalidReset for a layout beyond the task's count; None is a random layout."""
+    if layout is not None and not 0 <= layout < count:
+        raise InvalidReset(
+            f"layout {layout}: expected 0 <= layout < {count} for task {task}"
         )
 
 
-def near_configuration(task: Task, placement: Placement) -> bool:
-    """Whether source, target and yaw are all within the excluded distance of one configuration."""
+def near_grid_layout(task: Task, layout: Layout) -> bool:
+    """Whether source, target and yaw are all within the excluded distance of one layout."""
     ranges = task.random
     radius = ranges.exclusion_radius
     return any(
         _distance(
-            placement.source_x - grid.source_x,
-            placement.source_y - grid.source_y,
+            layout.source_x - grid.source_x,
+            layout.source_y - grid.source_y,
         )
         <= radius
-        and _distance(placement.target_x - grid.target_x, placement.target_y - grid.target_y)
+        and _distance(layout.target_x - grid.target_x, layout.target_y - grid.target_y)
         <= radius
-        and _turn(placement.source_yaw - grid.source_yaw) <= ranges.exclusion_yaw
-        for grid in task.configurations
+        and _turn(layout.source_yaw - grid.source_yaw) <= ranges.exclusion_yaw
+        for grid in task.layouts
     )
 
 
-def _draw(task: Task, seed: int) -> Placement:
+def _draw(task: Task, seed: int) -> Layout:
     ranges = task.random
     generator = SplitMix64(_fnv1a(task.name) ^ seed)
     for _ in range(_DRAWS_MAX):
-        placement = Placement(
+        layout = Layout(
             source_x=generator.uniform(*ranges.source_x),
             source_y=generator.uniform(*ranges.source_y),
             source_yaw=generator.uniform(*ranges.source_yaw),
@@ -74,12 +74,12 @@ def _draw(task: Task, seed: int) -> Placement:
             target_y=generator.uniform(*ranges.target_y),
         )
         apart = _distance(
-            placement.source_x - placement.target_x, placement.source_y - placement.target_y
+            layout.source_x - layout.target_x, layout.source_y - layout.target_y
         )
-        if apart >= ranges.separation_min and not near_configuration(task, placement):
-            return placement
-    raise InvalidPlacement(
-        f"task {task.name}, seed {seed}: no free placement in {_DRAWS_MAX} draws"
+        if apart >= ranges.separation_min and not near_grid_layout(task, layout):
+            return layout
+    raise InvalidReset(
+        f"task {task.name}, seed {seed}: no free layout in {_DRAWS_MAX} draws"
     )
 
 
