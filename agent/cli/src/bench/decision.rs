@@ -1,0 +1,313 @@
+//! One decision at a time: prefill, decode, parse, score, choose.
+
+use std::time::Instant;
+
+use anyhow::{Context, Result, ensure};
+use serde::Serialize;
+
+use super::torch::{Hello, Torch};
+use super::{Observation, bandwidth, quantile};
+use vla::Vla;
+use decision::ProposalRequest;
+use runtime::rollout::{Scene, candidate_action, score};
+use crate::strategy::Decision;
+use decision::Strategy;
+use verifier::Verifier;
+
+/// Numbers of candidates that are timed.
+const CANDIDATES: [usize; 5] = [1, 2, 5, 8, 16];
+/// The number that ratios are of: the default of every command.
+const CANDIDATES_DEFAULT: usize = 5;
+/// Rounds before any is counted: caches fill, compilers compile.
+const WARM_UP_ROUNDS: usize = 1;
+
+/// How candidates come about.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Setting {
+    /// Candidates per decision.
+    pub candidates: usize,
+    /// 0 for the greedy one, else 1.
+    pub temperature: f32,
+}
+
+/// What the decisions of one setting cost.
+#[derive(Debug, Clone, Serialize)]
+pub struct Row {
+    /// Of what.
+    #[serde(flatten)]
+    pub setting: Setting,
+    /// Image and prompt.
+    pub prefill_ms: f64,
+    /// One token of every candidate, none of them shared.
+    pub step_ms: f64,
+    /// Of all candidates of a decision, mean.
+    pub tokens: f64,
+    /// Prefill, decode, parse, score, choose.
+    pub decision_ms_p50: f64,
+    /// The slow ones.
+    pub decision_ms_p95: f64,
+    /// Tokens of all candidates over the whole decision's time.
+    pub tokens_per_second: f64,
+    /// Bytes of weights that a step reads.
+    pub weight_bytes: usize,
+    /// Of the bandwidth at which this machine's processors read as many bytes.
+    pub bandwidth_share: f64,
+}
+
+/// The same decisions in PyTorch, without parsing, scoring and choosing.
+#[derive(Debug, Clone, Serialize)]
+pub struct Comparison {
+    /// Eager, compiled, ….
+    pub setting: String,
+    /// Per decision.
+    pub candidates: usize,
+    /// Prefill and decode.
+    pub decision_ms_p50: f64,
+    /// The slow ones.
+    pub decision_ms_p95: f64,
+}
+
+/// All of one run.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    /// Ours; the first is the greedy one.
+    pub rows: Vec<Row>,
+    /// Reading as many bytes as a step's weights, over all threads.
+    pub bandwidth_bytes_per_second: f64,
+    /// Five verified candidates over one greedy candidate, by medians.
+    pub ratio_greedy: f64,
+    /// PyTorch eager over ours at five candidates; only with a comparison.
+    pub ratio_eager: Option<f64>,
+    /// The best PyTorch setting over ours at five candidates.
+    pub ratio_best: Option<f64>,
+    /// PyTorch's times.
+    pub torch: Vec<Comparison>,
+    /// Which PyTorch.
+    pub torch_hello: Option<Hello>,
+    /// Threads of ours.
+    pub threads: usize,
+    /// Decisions behind every median.
+    pub decisions: usize,
+    /// Digest of the policy.
+    pub policy: String,
+    /// Digest of the verifier.
+    pub verifier: String,
+}
+
+/// What is timed.
+#[derive(Clone, Copy)]
+pub struct DecisionBench<'a> {
+    /// Proposes.
+    pub policy: &'a Policy,
+    /// Scores.
+    pub verifier: &'a Verifier,
+    /// Decisions are made on these in turn.
+    pub observations: &'a [Observation],
+    /// Passes over all observations that are counted.
+    pub rounds: usize,
+}
+
+impl DecisionBench<'_> {
+    /// Times every setting, and PyTorch's, in turns.
+    pub fn run(&self, mut torch: Option<Torch>, mut progress: impl FnMut(usize)) -> Result<Report> {
+        ensure!(self.rounds > 0, "rounds: expected at least 1, got 0");
+        let settings = settings();
+        let hello = torch.as_ref().map(|torch| torch.hello.clone());
+        let torch_settings = hello.as_ref().map(|hello| hello.settings.clone()).unwrap_or_default();
+        let mut ours: Vec<Samples> = settings.iter().map(|_| Samples::default()).collect();
+        let mut theirs: Vec<Vec<Vec<f64>>> =
+            vec![vec![Vec::new(); settings.len()]; torch_settings.len()];
+        for round in 0..WARM_UP_ROUNDS + self.rounds {
+            progress(round);
+            let is_counted = round >= WARM_UP_ROUNDS;
+            for (index, observation) in self.observations.iter().enumerate() {
+                for (which, setting) in settings.iter().enumerate() {
+                    let (ms, tokens) = self.decide(observation, *setting, round as u64)?;
+                    if is_counted {
+                        ours[which].add(ms, tokens.iter().map(Vec::len).sum());
+                    }
+                    let Some(torch) = torch.as_mut().filter(|_| setting.temperature > 0.0) else {
+                        continue;
+                    };
+                    for (name, times) in torch_settings.iter().zip(&mut theirs) {
+                        let ms = torch.decide(name, index, &tokens)?;
+                        if is_counted {
+                            times[which].push(ms);
+                        }
+                    }
+                }
+            }
+        }
+        let comparisons = torch_settings.iter().zip(theirs).flat_map(|(name, times)| {
+            settings.iter().zip(times).filter(|(_, times)| !times.is_empty()).map(
+                |(setting, mut times)| {
+                    times.sort_by(f64::total_cmp);
+                    Comparison {
+                        setting: name.clone(),
+                        candidates: setting.candidates,
+                        decision_ms_p50: quantile(&times, 0.5),
+                        decision_ms_p95: quantile(&times, 0.95),
+                    }
+                },
+            )
+        });
+        self.report(&settings, ours, comparisons.collect(), hello)
+    }
+
+    /// Milliseconds of one verified decision, and every candidate's tokens.
+    fn decide(
+        &self,
+        observation: &Observation,
+        setting: Setting,
+        seed: u64,
+    ) -> Result<(f64, Vec<Vec<u32>>)> {
+        let DecisionBench { policy, verifier, .. } = self;
+        let Setting { candidates, temperature } = setting;
+        let Observation { image, instruction } = observation;
+        let start = Instant::now();
+        let request = ProposalRequest { image, instruction, candidates, temperature, seed };
+        let proposal = policy.propose(&[request])?.pop().context("no proposal")?;
+        let actions: Vec<_> = proposal.candidates.iter().map(candidate_action).collect();
+        // Greedy decoding asks no verifier.
+        let logits = (temperature > 0.0).then(|| {
+            let scene = Scene { instruction: instruction.clone(), ..Scene::default() };
+            score(verifier, &proposal, policy, &mut { scene })
+        });
+        let strategy = if logits.is_some() { Strategy::Verifier } else { Strategy::Greedy };
+        std::hint::black_box(strategy.choose(&Decision {
+            candidates: &actions,
+            logits: logits.as_deref(),
+            expert_action: None,
+            action_scale: &policy.action_scale(),
+        }));
+        let ms = start.elapsed().as_secs_f64() * 1e3;
+        Ok((ms, proposal.candidates.into_iter().map(|candidate| candidate.tokens).collect()))
+    }
+
+    fn report(
+        &self,
+        settings: &[Setting],
+        samples: Vec<Samples>,
+        torch: Vec<Comparison>,
+        torch_hello: Option<Hello>,
+    ) -> Result<Report> {
+        let weight_bytes = self.policy.step_bytes();
+        let bandwidth = bandwidth::measure(weight_bytes);
+        let rows = settings.iter().zip(samples);
+        let rows = rows.map(|(setting, samples)| self.row(*setting, samples, bandwidth));
+        let rows = rows.collect::<Result<Vec<Row>>>()?;
+        let verified = rows.iter().find(|row| row.setting == sampled(CANDIDATES_DEFAULT));
+        let verified = verified.context("five candidates are always timed")?.decision_ms_p50;
+        let of_torch = |setting: Option<&str>| {
+            torch
+                .iter()
+                .filter(|one| one.candidates == CANDIDATES_DEFAULT)
+                .filter(|one| setting.is_none_or(|setting| setting == one.setting))
+                .map(|one| one.decision_ms_p50 / verified)
+                .min_by(f64::total_cmp)
+        };
+        let eager = torch_hello.as_ref().and_then(|hello| hello.settings.first());
+        Ok(Report {
+            ratio_greedy: verified / rows[0].decision_ms_p50,
+            ratio_eager: eager.and_then(|setting| of_torch(Some(setting))),
+            ratio_best: of_torch(None),
+            bandwidth_bytes_per_second: bandwidth,
+            torch,
+            torch_hello,
+            threads: rayon::current_num_threads(),
+            decisions: self.rounds * self.observations.len(),
+            policy: self.policy.digest().to_owned(),
+            verifier: self.verifier.digest().to_owned(),
+            rows,
+        })
+    }
+
+    fn row(&self, setting: Setting, mut samples: Samples, bandwidth: f64) -> Result<Row> {
+        samples.ms.sort_by(f64::total_cmp);
+        let Samples { ms, tokens } = samples;
+        let seconds = ms.iter().sum::<f64>() / 1e3;
+        let tokens_mean = tokens as f64 / ms.len() as f64;
+        let steps = (tokens_mean / setting.candidates as f64).round() as usize;
+        let Setting { candidates, temperature } = setting;
+        let (mut prefill_ms, mut step_ms) = (f64::INFINITY, f64::INFINITY);
+        for Observation { image, instruction } in self.observations {
+            let request = ProposalRequest { image, instruction, candidates, temperature, seed: 0 };
+            let timings = self.policy.time(&[request], steps.max(1))?;
+            prefill_ms = prefill_ms.min(timings.prefill_ms);
+            step_ms = step_ms.min(timings.step_ms);
+        }
+        let weight_bytes = self.policy.step_bytes();
+        Ok(Row {
+            setting,
+            prefill_ms,
+            step_ms,
+            tokens: tokens_mean,
+            decision_ms_p50: quantile(&ms, 0.5),
+            decision_ms_p95: quantile(&ms, 0.95),
+            tokens_per_second: tokens as f64 / seconds,
+            weight_bytes,
+            bandwidth_share: weight_bytes as f64 / (step_ms / 1e3) / bandwidth,
+        })
+    }
+}
+
+/// Times and tokens of one setting's decisions.
+#[derive(Debug, Default)]
+struct Samples {
+    ms: Vec<f64>,
+    tokens: usize,
+}
+
+impl Samples {
+    fn add(&mut self, ms: f64, tokens: usize) {
+        self.ms.push(ms);
+        self.tokens += tokens;
+    }
+}
+
+/// Greedy first, then the sampled ones.
+fn settings() -> Vec<Setting> {
+    let greedy = Setting { candidates: 1, temperature: 0.0 };
+    std::iter::once(greedy).chain(CANDIDATES.map(sampled)).collect()
+}
+
+fn sampled(candidates: usize) -> Setting {
+    Setting { candidates, temperature: 1.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bench::read_observations;
+    use vla::DeviceName;
+    use std::path::Path;
+
+    #[test]
+    fn every_setting_is_timed_on_every_observation() {
+        let agent = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let model = agent.join("models/bridge-small");
+        let policy = Policy::load(&model, DeviceName::Cpu).expect("the shipped policy");
+        let file = model.join("verifier.safetensors");
+        let verifier = Verifier::load(&file, policy.digest()).expect("the shipped verifier");
+        let observations =
+            read_observations(&agent.join("tests/fixtures/bridge-small.safetensors"));
+        let observations = &observations.expect("recorded ones")[..2];
+        let bench = DecisionBench { policy: &policy, verifier: &verifier, observations, rounds: 1 };
+        let report = bench.run(None, |_| ()).expect("a report");
+        let settings: Vec<Setting> = report.rows.iter().map(|row| row.setting).collect();
+        assert_eq!(settings, super::settings());
+        assert_eq!(report.decisions, 2);
+        for row in &report.rows {
+            assert!(0.0 < row.decision_ms_p50 && row.decision_ms_p50 <= row.decision_ms_p95);
+            // 17 tokens of reasoning and 7 of action; a malformed candidate may have fewer or more.
+            let each = row.tokens / row.setting.candidates as f64;
+            assert!((18.0..=30.0).contains(&each), "{row:?}");
+        }
+        let p50 = |setting: Setting| {
+            report.rows.iter().find(|row| row.setting == setting).expect("timed").decision_ms_p50
+        };
+        let greedy = Setting { candidates: 1, temperature: 0.0 };
+        assert_eq!(report.ratio_greedy, p50(sampled(5)) / p50(greedy));
+        assert_eq!((report.ratio_eager, report.ratio_best), (None, None));
+    }
+}

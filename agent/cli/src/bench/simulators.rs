@@ -1,0 +1,143 @@
+//! Our simulators side by side: control steps per second over the wire, with an image and without.
+
+use std::time::Duration;
+
+use anyhow::{Context, Result, ensure};
+use serde::Serialize;
+
+use super::quantile;
+use super::wire::{EPISODE_STEPS, WARM_UP_STEPS, at_once, circling, open, reset};
+use runtime::servers::LocalServers;
+use runtime::simulator::{ServerProgram, Simulator};
+use runtime::site::Site;
+use runtime::wire::{Environment, Episode, Network};
+
+/// Local servers are on the network already.
+const SERVERS_WAIT: Duration = Duration::from_secs(30);
+/// Nothing is rendered for an image of no pixels.
+const SIDE_NONE: u32 = 0;
+
+/// One number of sessions, all of them asking one server at once.
+#[derive(Debug, Clone, Serialize)]
+pub struct Row {
+    /// Height and width of the image; 0 without one.
+    pub side: u32,
+    /// Sessions of each server.
+    pub sessions: usize,
+    /// Of each server, counted.
+    pub steps: usize,
+    /// Control steps per second of the Python server: the median round.
+    pub python_steps_per_second: f64,
+    /// And of the native one.
+    pub native_steps_per_second: f64,
+}
+
+/// What is timed.
+pub struct SimulatorsBench<'a> {
+    /// Where the servers are started; its own simulator does not matter.
+    pub site: &'a Site,
+    /// Numbers of sessions.
+    pub sessions: &'a [usize],
+    /// Control steps of every session.
+    pub steps: usize,
+    /// Of the image, in pixels.
+    pub side: u32,
+}
+
+impl SimulatorsBench<'_> {
+    /// Starts one server of each simulator and lets them take turns, step by step.
+    pub fn run(&self) -> Result<Vec<Row>> {
+        ensure!(self.steps > 0, "steps: expected at least 1, got 0");
+        ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
+        let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
+        let programs = [Simulator::Python, Simulator::Native]
+            .map(|simulator| ServerProgram::prepare(simulator, self.site.python_environment()?));
+        let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+        let network = runtime.block_on(Network::open(self.site.network_options()))?;
+        let mut servers = Vec::new();
+        for program in programs {
+            servers.push(self.site.start(program?, &network, most)?);
+        }
+        let rows = runtime.block_on(self.rows(&network, &servers, most));
+        // Servers first: they would report the network's end as an error.
+        drop(servers);
+        runtime.block_on(network.close())?;
+        rows
+    }
+
+    async fn rows(
+        &self,
+        network: &Network,
+        servers: &[LocalServers],
+        most: usize,
+    ) -> Result<Vec<Row>> {
+        network.servers(servers.len(), SERVERS_WAIT).await;
+        let mut rows = Vec::new();
+        for side in [SIDE_NONE, self.side] {
+            let mut both = Vec::new();
+            for server in servers {
+                let id = server.server_ids().pop().context("a local server is not ready")?;
+                let mut environments = Vec::new();
+                for index in 0..most {
+                    environments.push(open(network, &id, side, index).await?);
+                }
+                both.push(environments);
+            }
+            for &sessions in self.sessions {
+                let rests: Vec<_> = both.iter_mut().map(|all| all.split_off(sessions)).collect();
+                let (row, used) = self.count(side, both).await?;
+                rows.push(row);
+                both = used;
+                both.iter_mut().zip(rests).for_each(|(all, rest)| all.extend(rest));
+            }
+            for environment in both.into_iter().flatten() {
+                environment.close().await?;
+            }
+        }
+        Ok(rows)
+    }
+
+    async fn count(
+        &self,
+        side: u32,
+        both: Vec<Vec<Environment>>,
+    ) -> Result<(Row, Vec<Vec<Environment>>)> {
+        let sessions = both[0].len();
+        let mut episodes = Vec::new();
+        for environments in both {
+            episodes.push(reset(environments).await?);
+        }
+        let mut times = vec![Vec::new(); episodes.len()];
+        for index in 0..WARM_UP_STEPS + self.steps {
+            let is_over = index % EPISODE_STEPS == EPISODE_STEPS - 1;
+            let mut after = Vec::new();
+            for (mut own, times) in episodes.into_iter().zip(&mut times) {
+                if is_over {
+                    own = reset(own.into_iter().map(Episode::finish).collect()).await?;
+                }
+                let (step_ms, own) = at_once(own, |mut episode: Episode| async move {
+                    episode.step(circling(index)).await.map(|_| episode)
+                })
+                .await?;
+                if index >= WARM_UP_STEPS {
+                    times.push(step_ms);
+                }
+                after.push(own);
+            }
+            episodes = after;
+        }
+        let per_second = |times: &mut Vec<f64>| {
+            times.sort_by(f64::total_cmp);
+            1e3 / quantile(times, 0.5)
+        };
+        let row = Row {
+            side,
+            sessions,
+            steps: self.steps * sessions,
+            python_steps_per_second: per_second(&mut times[0]),
+            native_steps_per_second: per_second(&mut times[1]),
+        };
+        let finish = |own: Vec<Episode>| own.into_iter().map(Episode::finish).collect();
+        Ok((row, episodes.into_iter().map(finish).collect()))
+    }
+}

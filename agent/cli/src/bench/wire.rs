@@ -1,0 +1,267 @@
+//! What a control step costs over the wire, beside what the simulator needs for it.
+//!
+//! A reply to a step says what the simulator took for it; the rest of the round trip is the wire: request, queues, writing
+//! the reply, its picture's way, reading it.
+//!
+//! Beside each step, in turns: the same reply once more, which a server sends without simulating or writing anything, and
+//! as many bytes through a bare socket, which is what this machine takes for them at that hour.
+
+use std::f32::consts::TAU;
+use std::io::{Read, Result as IoResult, Write};
+use std::os::unix::net::UnixStream;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, ensure};
+use protocol::{Open, PROTOCOL_VERSION, Reset};
+use serde::Serialize;
+use tokio::task::JoinSet;
+
+use super::quantile;
+use runtime::simulator::Simulator;
+use runtime::site::Site;
+use store::plan::SeedRange;
+use evaluation::suite::TASKS;
+use decision::VARIANT_DEFAULT;
+use runtime::wire::{Environment, EnvironmentFault, Episode, Network};
+
+/// Steps before an episode is begun anew: no task's horizon is shorter.
+pub(super) const EPISODE_STEPS: usize = 50;
+/// The first steps fill caches.
+pub(super) const WARM_UP_STEPS: usize = 5;
+/// Control steps for a round of the gripper.
+const ROUND_STEPS: f32 = 16.0;
+/// How far it goes in a step, in metres: about as far as in an episode of the expert.
+const STEP_LENGTH: f32 = 0.02;
+/// The local server is on the network already.
+pub(super) const SERVER_WAIT: Duration = Duration::from_secs(30);
+
+/// A Step as it is sent.
+const REQUEST_BYTES: usize = 62;
+
+/// One number of sessions on one server, all of them asking at once.
+#[derive(Debug, Clone, Serialize)]
+pub struct Row {
+    /// What the server is.
+    pub simulator: Simulator,
+    /// Sessions of the server.
+    pub sessions: usize,
+    /// Of all sessions, counted.
+    pub steps: usize,
+    /// One control step with its image: the time of all sessions' steps over their number, median.
+    pub step_ms_p50: f64,
+    /// What of it the simulator took, as the server says: median of the sessions' means.
+    pub simulator_ms_p50: f64,
+    /// The rest of it, median.
+    pub wire_ms_p50: f64,
+    /// The slow ones.
+    pub wire_ms_p95: f64,
+    /// A repeated reply: the time of all sessions' repetitions over their number, median.
+    pub repeat_ms_p50: f64,
+    /// A reply: median of the sessions' means.
+    pub reply_bytes_p50: f64,
+    /// One request's and one reply's bytes through a socket between two threads, median.
+    pub bare_ms_p50: f64,
+}
+
+/// What is timed.
+pub struct WireBench<'a> {
+    /// Where the server is started.
+    pub site: &'a Site,
+    /// Numbers of sessions.
+    pub sessions: &'a [usize],
+    /// Control steps of every session.
+    pub steps: usize,
+    /// Of the image, in pixels.
+    pub side: u32,
+}
+
+impl WireBench<'_> {
+    /// Starts one server and takes turns for each number of sessions.
+    pub fn run(&self) -> Result<Vec<Row>> {
+        ensure!(self.steps > 0, "steps: expected at least 1, got 0");
+        ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
+        let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
+        let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+        self.site.run(&runtime, most, async |network, _| {
+            let found = network.servers(1, SERVER_WAIT).await;
+            let server = &found.first().context("the local server was not to be seen")?.server;
+            let mut environments = Vec::new();
+            for index in 0..most {
+                environments.push(open(network, server, self.side, index).await?);
+            }
+            let mut rows = Vec::new();
+            for &sessions in self.sessions {
+                let rest = environments.split_off(sessions);
+                let (row, used) = self.count(environments).await?;
+                rows.push(row);
+                environments = used;
+                environments.extend(rest);
+            }
+            Ok(rows)
+        })
+    }
+
+    /// Steps and repetitions of these sessions in turns.
+    async fn count(&self, environments: Vec<Environment>) -> Result<(Row, Vec<Environment>)> {
+        let sessions = environments.len();
+        let mut socket = BareSocket::open().context("cannot open a socket")?;
+        let [mut stepped, mut simulated, mut wire, mut repeated, mut sizes, mut bare] =
+            [const { Vec::new() }; 6];
+        let mut episodes = reset(environments).await?;
+        for index in 0..WARM_UP_STEPS + self.steps {
+            if index % EPISODE_STEPS == EPISODE_STEPS - 1 {
+                episodes = reset(episodes.into_iter().map(Episode::finish).collect()).await?;
+            }
+            let (step_ms, after) = at_once(episodes, |mut episode: Episode| async move {
+                episode.step(circling(index)).await.map(|_| episode)
+            })
+            .await?;
+            let in_simulator = after.iter().map(Episode::simulator_time).sum::<Duration>();
+            let simulator_ms = in_simulator.as_secs_f64() * 1e3 / sessions as f64;
+            let (repeat_ms, after) = at_once(after, |mut episode: Episode| async move {
+                episode.repeat().await.map(|()| episode)
+            })
+            .await?;
+            let reply_bytes = after.iter().map(Episode::reply_bytes).sum::<usize>() / sessions;
+            let bare_ms = socket.exchange(reply_bytes).context("the socket's other end is gone")?;
+            if index >= WARM_UP_STEPS {
+                stepped.push(step_ms);
+                simulated.push(simulator_ms);
+                wire.push(step_ms - simulator_ms);
+                repeated.push(repeat_ms);
+                sizes.push(reply_bytes as f64);
+                bare.push(bare_ms);
+            }
+            episodes = after;
+        }
+        for figures in
+            [&mut stepped, &mut simulated, &mut wire, &mut repeated, &mut sizes, &mut bare]
+        {
+            figures.sort_by(f64::total_cmp);
+        }
+        let row = Row {
+            simulator: self.site.simulator,
+            sessions,
+            steps: self.steps * sessions,
+            step_ms_p50: quantile(&stepped, 0.5),
+            simulator_ms_p50: quantile(&simulated, 0.5),
+            wire_ms_p50: quantile(&wire, 0.5),
+            wire_ms_p95: quantile(&wire, 0.95),
+            repeat_ms_p50: quantile(&repeated, 0.5),
+            reply_bytes_p50: quantile(&sizes, 0.5),
+            bare_ms_p50: quantile(&bare, 0.5),
+        };
+        Ok((row, episodes.into_iter().map(Episode::finish).collect()))
+    }
+}
+
+/// The gripper goes in circles above the table, and opens and closes: as much of the picture changes as in an episode.
+pub(super) fn circling(step: usize) -> [f32; 7] {
+    let angle = step as f32 * TAU / ROUND_STEPS;
+    let (across, along) = angle.sin_cos();
+    let gripper = if across < 0.0 { -1.0 } else { 1.0 };
+    [STEP_LENGTH * along, STEP_LENGTH * across, 0.0, 0.0, 0.0, 0.0, gripper]
+}
+
+/// A thread that gives a reply's bytes for a request's bytes; it ends with this.
+struct BareSocket {
+    stream: UnixStream,
+    reply: Vec<u8>,
+}
+
+impl BareSocket {
+    fn open() -> IoResult<Self> {
+        let (stream, mut other) = UnixStream::pair()?;
+        thread::spawn(move || {
+            let (mut request, mut reply) = ([0; REQUEST_BYTES], Vec::new());
+            while other.read_exact(&mut request).is_ok() {
+                let [a, b, c, d, ..] = request;
+                reply.resize(u32::from_le_bytes([a, b, c, d]) as usize, 0);
+                if other.write_all(&reply).is_err() {
+                    break;
+                }
+            }
+        });
+        Ok(Self { stream, reply: Vec::new() })
+    }
+
+    /// Milliseconds of one exchange with so large a reply. Blocks.
+    fn exchange(&mut self, reply_bytes: usize) -> IoResult<f64> {
+        self.reply.resize(reply_bytes, 0);
+        let mut request = [0; REQUEST_BYTES];
+        request[..4].copy_from_slice(&(reply_bytes as u32).to_le_bytes());
+        let begun = Instant::now();
+        self.stream.write_all(&request)?;
+        self.stream.read_exact(&mut self.reply)?;
+        Ok(begun.elapsed().as_secs_f64() * 1e3)
+    }
+}
+
+/// A session of the task that comes at this place.
+pub(super) async fn open(
+    network: &Network,
+    server: &str,
+    side: u32,
+    index: usize,
+) -> Result<Environment> {
+    let open = Open {
+        protocol: PROTOCOL_VERSION,
+        task: TASKS[index % TASKS.len()].to_owned(),
+        variant: VARIANT_DEFAULT.to_owned(),
+        image_height: side,
+        image_width: side,
+        expert: false,
+        holder: "bench".to_owned(),
+    };
+    Environment::open(network, server, open).await.context("cannot open a session")
+}
+
+/// Begins an episode in every session.
+pub(super) async fn reset(environments: Vec<Environment>) -> Result<Vec<Episode>> {
+    let begin = |(index, environment): (usize, Environment)| {
+        let reset = Reset {
+            task: TASKS[index % TASKS.len()].to_owned(),
+            variant: VARIANT_DEFAULT.to_owned(),
+            layout: None,
+            seed: SeedRange::Tuning.first() + index as u64,
+        };
+        environment.reset(reset)
+    };
+    let (_, episodes) = at_once(environments.into_iter().enumerate().collect(), begin).await?;
+    Ok(episodes)
+}
+
+/// Asks something of all sessions at once; milliseconds over their number, and what came back, in order.
+pub(super) async fn at_once<From, To, Answer>(
+    sessions: Vec<From>,
+    ask: impl Fn(From) -> Answer,
+) -> Result<(f64, Vec<To>)>
+where
+    To: Send + 'static,
+    Answer: Future<Output = Result<To, EnvironmentFault>> + Send + 'static,
+{
+    let count = sessions.len();
+    let begun = Instant::now();
+    if count == 1 {
+        // Alone it needs no task beside this one, whose start and end would count as the wire's.
+        let mut answers = Vec::new();
+        for session in sessions {
+            answers.push(ask(session).await?);
+        }
+        return Ok((begun.elapsed().as_secs_f64() * 1e3, answers));
+    }
+    let mut asked = JoinSet::new();
+    for (index, session) in sessions.into_iter().enumerate() {
+        let answer = ask(session);
+        asked.spawn(async move { (index, answer.await) });
+    }
+    let mut answers = Vec::with_capacity(count);
+    while let Some(joined) = asked.join_next().await {
+        let (index, answer) = joined.context("a request panicked")?;
+        answers.push((index, answer?));
+    }
+    let ms = begun.elapsed().as_secs_f64() * 1e3 / count as f64;
+    answers.sort_by_key(|(index, _)| *index);
+    Ok((ms, answers.into_iter().map(|(_, answer)| answer).collect()))
+}

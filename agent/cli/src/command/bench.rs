@@ -1,0 +1,380 @@
+//! `rever bench`: what the parts of the program cost on this machine.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Arc;
+
+use anyhow::{Context, Result, ensure};
+use clap::{Args, Subcommand};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::episodes::policy_folder;
+use crate::bench::{DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench, read_observations};
+use vla::{DeviceName, Vla};
+use runtime::setup;
+use runtime::simulator::Simulator;
+use runtime::site::Site;
+use verifier::Verifier;
+
+/// What the parts of the program cost on this machine.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    #[command(subcommand)]
+    part: Part,
+}
+
+#[derive(Debug, Subcommand)]
+enum Part {
+    Decision(DecisionArguments),
+    Throughput(ThroughputArguments),
+    Wire(WireArguments),
+    Simulators(SimulatorsArguments),
+}
+
+/// One decision at a time on recorded observations: prefill, decode, parse, score, choose
+#[derive(Debug, Args)]
+struct DecisionArguments {
+    /// The checkpoint's folder [default: the one that comes with rever]
+    #[arg(long)]
+    policy: Option<PathBuf>,
+    /// Where the policy computes: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    device: DeviceName,
+    /// The verifier's file [default: the one beside the policy's weights]
+    #[arg(long)]
+    verifier: Option<PathBuf>,
+    /// Recorded observations: images and instructions [default: eight of the shipped policy's size]
+    #[arg(long, value_name = "FILE")]
+    observations: Option<PathBuf>,
+    /// Passes over all observations
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..))]
+    rounds: u32,
+    /// Make the same decisions in PyTorch, in turns
+    #[arg(long)]
+    compare: bool,
+    /// A Python that has PyTorch, for --compare
+    #[arg(long, value_name = "FILE", default_value = "python3")]
+    python: PathBuf,
+    /// Write the figures into this file, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Whole episodes, many at once: decisions and episodes per second, and this process's memory
+#[derive(Debug, Args)]
+struct ThroughputArguments {
+    /// Episodes at once, separated by commas
+    #[arg(long, value_delimiter = ',', default_value = "1,2,4,8,16",
+          value_parser = clap::value_parser!(u16).range(1..=256))]
+    sessions: Vec<u16>,
+    /// Decisions that are counted for each number of sessions
+    #[arg(long, default_value_t = 2_000, value_parser = clap::value_parser!(u64).range(1..))]
+    decisions: u64,
+    /// Candidates per decision
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=256))]
+    candidates: u32,
+    /// Server processes to start
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=64))]
+    servers: u16,
+    /// What these processes are
+    #[arg(long, value_enum, default_value_t)]
+    simulator: Simulator,
+    /// The checkpoint's folder, with its verifier [default: the one that comes with rever]
+    #[arg(long)]
+    policy: Option<PathBuf>,
+    /// Where the policy computes: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    device: DeviceName,
+    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    #[arg(long, value_name = "FILE")]
+    python: Option<PathBuf>,
+    /// Write the figures into this file, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Control steps over the wire, less what the simulator took for them, beside repeated replies
+#[derive(Debug, Args)]
+struct WireArguments {
+    /// Sessions of one server that ask at once, separated by commas
+    #[arg(long, value_delimiter = ',', default_value = "1,8,32",
+          value_parser = clap::value_parser!(u16).range(1..=64))]
+    sessions: Vec<u16>,
+    /// What the server is, one after the other, separated by commas
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "native,python")]
+    simulator: Vec<Simulator>,
+    #[command(flatten)]
+    steps: StepsArguments,
+}
+
+/// Control steps of the Python and the native server, in turns, with an image and without
+#[derive(Debug, Args)]
+struct SimulatorsArguments {
+    /// Sessions of each server that ask at once, separated by commas
+    #[arg(long, value_delimiter = ',', default_value = "1,2,4,8",
+          value_parser = clap::value_parser!(u16).range(1..=64))]
+    sessions: Vec<u16>,
+    #[command(flatten)]
+    steps: StepsArguments,
+}
+
+/// What both benchmarks of control steps ask
+#[derive(Debug, Args)]
+struct StepsArguments {
+    /// Control steps of every session
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
+    steps: u32,
+    /// Height and width of the image
+    #[arg(long, default_value_t = 224, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    side: u32,
+    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    #[arg(long, value_name = "FILE")]
+    python: Option<PathBuf>,
+    /// Write the figures into this file, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Times what was asked for and prints a table.
+pub fn run(arguments: Arguments) -> Result<()> {
+    match arguments.part {
+        Part::Decision(arguments) => decision(arguments),
+        Part::Throughput(arguments) => throughput(arguments),
+        Part::Wire(arguments) => wire(arguments),
+        Part::Simulators(arguments) => simulators(arguments),
+    }?;
+    println!("commit {}", commit());
+    Ok(())
+}
+
+/// What was measured: the checkout's commit, `-dirty` when something in it differs.
+fn commit() -> String {
+    let describe = || -> Result<String> {
+        let mut git = Command::new("git");
+        git.args(["describe", "--always", "--dirty", "--abbrev=10"]);
+        let output = git.current_dir(setup::repository()?).output()?;
+        ensure!(output.status.success(), "no git checkout");
+        Ok(String::from_utf8(output.stdout)?.trim().to_owned())
+    };
+    describe().unwrap_or_else(|_| "unknown".to_owned())
+}
+
+fn wire(arguments: WireArguments) -> Result<()> {
+    let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
+    let (steps, side) = (arguments.steps.steps as usize, arguments.steps.side);
+    let mut rows = Vec::new();
+    for &simulator in &arguments.simulator {
+        let site = site(1, simulator, arguments.steps.python.clone());
+        rows.extend(WireBench { site: &site, sessions: &sessions, steps, side }.run()?);
+    }
+    if let Some(path) = &arguments.steps.json {
+        write_json(path, serde_json::json!({ "side": side, "rows": rows }))?;
+    }
+    println!(
+        "{:>9} {:>8} {:>7} {:>8} {:>12} {:>8} {:>8} {:>9} {:>8} {:>8} {:>7}",
+        "simulator",
+        "sessions",
+        "steps",
+        "step ms",
+        "simulator ms",
+        "wire ms",
+        "wire p95",
+        "repeat ms",
+        "reply kB",
+        "bare ms",
+        "share"
+    );
+    for row in rows {
+        println!(
+            "{:>9} {:>8} {:>7} {:>8.3} {:>12.3} {:>8.3} {:>8.3} {:>9.3} {:>8.1} {:>8.3} {:>5.1} %",
+            row.simulator.to_string(),
+            row.sessions,
+            row.steps,
+            row.step_ms_p50,
+            row.simulator_ms_p50,
+            row.wire_ms_p50,
+            row.wire_ms_p95,
+            row.repeat_ms_p50,
+            row.reply_bytes_p50 / 1e3,
+            row.bare_ms_p50,
+            100.0 * row.wire_ms_p50 / row.step_ms_p50
+        );
+    }
+    println!(
+        "one server of each, {side} x {side} pixels; per step of all sessions, medians; wire: a step less its simulator's time; \
+         repeat: the same reply again; bare: as many bytes through a socket"
+    );
+    Ok(())
+}
+
+fn simulators(arguments: SimulatorsArguments) -> Result<()> {
+    let site = site(1, Simulator::Python, arguments.steps.python.clone());
+    let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
+    let steps = arguments.steps.steps as usize;
+    let bench =
+        SimulatorsBench { site: &site, sessions: &sessions, steps, side: arguments.steps.side };
+    let rows = bench.run()?;
+    if let Some(path) = &arguments.steps.json {
+        write_json(path, serde_json::json!({ "rows": rows }))?;
+    }
+    println!(
+        "{:>6} {:>8} {:>7} {:>9} {:>9} {:>6}",
+        "pixels", "sessions", "steps", "python", "native", "ratio"
+    );
+    for row in rows {
+        let (python, native) = (row.python_steps_per_second, row.native_steps_per_second);
+        println!(
+            "{:>6} {:>8} {:>7} {python:>9.1} {native:>9.1} {:>6.2}",
+            row.side,
+            row.sessions,
+            row.steps,
+            native / python
+        );
+    }
+    println!(
+        "control steps per second of one server process, in turns; 0 pixels: nothing is rendered"
+    );
+    Ok(())
+}
+
+/// Servers of this benchmark alone.
+fn site(servers: usize, simulator: Simulator, python: Option<PathBuf>) -> Site {
+    Site { servers, simulator, python, fleet: "bench".to_owned(), ..Site::default() }
+}
+
+fn throughput(arguments: ThroughputArguments) -> Result<()> {
+    let folder = policy_folder(arguments.policy.as_ref())?;
+    let policy = Policy::load(&folder, arguments.device)?;
+    let verifier = Verifier::load(&folder.join("verifier.safetensors"), policy.digest())?;
+    let site = site(usize::from(arguments.servers), arguments.simulator, arguments.python);
+    let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
+    let bench = ThroughputBench {
+        policy: &policy,
+        verifier: Arc::new(verifier),
+        site: &site,
+        sessions: &sessions,
+        decisions: arguments.decisions,
+        candidates: arguments.candidates,
+    };
+    let rows = bench.run()?;
+    if let Some(path) = &arguments.json {
+        write_json(path, serde_json::json!({ "candidates": arguments.candidates, "rows": rows }))?;
+    }
+    println!(
+        "{:>8} {:>10} {:>12} {:>11} {:>9} {:>9}",
+        "sessions", "decisions", "decisions/s", "episodes/s", "MB before", "MB after"
+    );
+    for row in rows {
+        println!(
+            "{:>8} {:>10} {:>12.1} {:>11.2} {:>9.1} {:>9.1}",
+            row.sessions,
+            row.decisions,
+            row.decisions_per_second,
+            row.episodes_per_second,
+            row.memory_mb_before,
+            row.memory_mb_after
+        );
+    }
+    println!("{} candidates, {} server processes", arguments.candidates, arguments.servers);
+    Ok(())
+}
+
+/// Writes an object of figures, with the commit.
+fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
+    figures["commit"] = commit().into();
+    let text = serde_json::to_string_pretty(&figures)?;
+    std::fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn decision(arguments: DecisionArguments) -> Result<()> {
+    ensure!(
+        !arguments.compare || arguments.device == DeviceName::Cpu,
+        "--compare: expected --device cpu, where PyTorch runs, got {}",
+        arguments.device
+    );
+    let folder = policy_folder(arguments.policy.as_ref())?;
+    let file = arguments.verifier.unwrap_or_else(|| folder.join("verifier.safetensors"));
+    let policy = Policy::load(&folder, arguments.device)?;
+    let verifier = Verifier::load(&file, policy.digest())?;
+    let recorded = match arguments.observations {
+        Some(file) => file,
+        None => setup::repository()?.join("agent/tests/fixtures/bridge-small.safetensors"),
+    };
+    let observations = read_observations(&recorded)?;
+    let torch = if arguments.compare {
+        let script = setup::repository()?.join("agent/training/bench.py");
+        Some(Torch::start(&arguments.python, &script, &folder, &recorded)?)
+    } else {
+        None
+    };
+    let progress = ProgressBar::new(u64::from(arguments.rounds) + 1);
+    let style = "bench: {pos}/{len} rounds, {eta} left";
+    progress.set_style(ProgressStyle::with_template(style).context("progress line")?);
+    let bench = DecisionBench {
+        policy: &policy,
+        verifier: &verifier,
+        observations: &observations,
+        rounds: arguments.rounds as usize,
+    };
+    let report = bench.run(torch, |round| progress.set_position(round as u64))?;
+    progress.finish_and_clear();
+    if let Some(path) = &arguments.json {
+        write_json(path, serde_json::to_value(&report)?)?;
+    }
+    print(&report);
+    Ok(())
+}
+
+fn print(report: &Report) {
+    println!(
+        "{:>10} {:>5} {:>10} {:>8} {:>7} {:>9} {:>9} {:>9} {:>10}",
+        "candidates",
+        "T",
+        "prefill ms",
+        "step ms",
+        "tokens",
+        "p50 ms",
+        "p95 ms",
+        "tokens/s",
+        "bandwidth"
+    );
+    for row in &report.rows {
+        println!(
+            "{:>10} {:>5} {:>10.2} {:>8.3} {:>7.1} {:>9.1} {:>9.1} {:>9.0} {:>8.0} %",
+            row.setting.candidates,
+            row.setting.temperature,
+            row.prefill_ms,
+            row.step_ms,
+            row.tokens,
+            row.decision_ms_p50,
+            row.decision_ms_p95,
+            row.tokens_per_second,
+            100.0 * row.bandwidth_share,
+        );
+    }
+    let megabytes = report.rows.first().map_or(0.0, |row| row.weight_bytes as f64 / 1e6);
+    println!(
+        "{} decisions each, {} threads; a step reads {megabytes:.1} MB of weights, this machine reads as much at {:.1} GB/s",
+        report.decisions,
+        report.threads,
+        report.bandwidth_bytes_per_second / 1e9,
+    );
+    for one in &report.torch {
+        println!(
+            "PyTorch {:<10} {:>3} candidates: {:>8.1} ms (p50) {:>8.1} ms (p95)",
+            one.setting, one.candidates, one.decision_ms_p50, one.decision_ms_p95
+        );
+    }
+    for why in report.torch_hello.iter().flat_map(|hello| &hello.broken) {
+        println!("PyTorch: {why}");
+    }
+    println!(
+        "ratio_greedy {:.2} (five verified candidates over one greedy one)",
+        report.ratio_greedy
+    );
+    if let (Some(eager), Some(best)) = (report.ratio_eager, report.ratio_best) {
+        println!(
+            "ratio_eager {eager:.2}, ratio_best {best:.2} (PyTorch over rever, five candidates)"
+        );
+    }
+}

@@ -1,0 +1,84 @@
+//! `rever conformance`: tests a server against the specification.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, bail, ensure};
+use clap::Args;
+
+use conformance::{Row, Verdict, test};
+use runtime::simulator::Simulator;
+use runtime::site::Site;
+
+/// Test a server against the protocol's specification, row by row
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// Start a server of ours and test it
+    #[arg(long, value_enum, conflicts_with = "connect")]
+    server: Option<Simulator>,
+    /// Test a server that runs already: its endpoint or a router's, as tcp/HOST:PORT
+    #[arg(long, value_delimiter = ',')]
+    connect: Vec<String>,
+    /// Only servers of the same fleet are looked for
+    #[arg(long, default_value = "local")]
+    fleet: String,
+    /// This server, when there are several [default: the first]
+    #[arg(long)]
+    id: Option<String>,
+    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    #[arg(long, value_name = "FILE")]
+    python: Option<PathBuf>,
+    /// Write the rows into this file, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Sessions of a server that is started here: few, so that all of them can be opened.
+const SESSIONS: usize = 4;
+/// Its idle limit: longer than a session may be without a holder, short enough to be waited for.
+const IDLE_SECS: u32 = 12;
+
+/// Prints each row when it is done; an error when one fails.
+pub fn run(arguments: Arguments) -> Result<()> {
+    if arguments.server.is_none() && arguments.connect.is_empty() {
+        bail!("expected --server or --connect, got none");
+    }
+    let site = Site {
+        servers: usize::from(arguments.server.is_some()),
+        simulator: arguments.server.unwrap_or_default(),
+        connect: arguments.connect,
+        fleet: arguments.fleet,
+        idle_secs: Some(IDLE_SECS),
+        python: arguments.python,
+        ..Site::default()
+    };
+    let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+    let id = arguments.id;
+    let rows = site.run(&runtime, SESSIONS, async |network, _| {
+        test(network, id.as_deref(), &mut print).await
+    })?;
+    if let Some(path) = &arguments.json {
+        let text = serde_json::to_string_pretty(&rows)?;
+        std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    let count = |verdict| rows.iter().filter(|row| row.verdict == verdict).count();
+    let (passed, failed) = (count(Verdict::Pass), count(Verdict::Fail));
+    println!("{passed} passed, {failed} failed, {} not tested", count(Verdict::Skip));
+    ensure!(
+        failed == 0,
+        "the server departs from the specification in {failed} of {} rows",
+        rows.len()
+    );
+    Ok(())
+}
+
+fn print(row: &Row) {
+    let verdict = match row.verdict {
+        Verdict::Pass => "pass",
+        Verdict::Fail => "FAIL",
+        Verdict::Skip => "skip",
+    };
+    println!("{verdict} {:<15} {}", row.name, row.rule);
+    if let Some(reason) = &row.reason {
+        println!("     {:<15} {reason}", "");
+    }
+}

@@ -1,0 +1,88 @@
+//! `rever report`: builds the page of a run, which opens from disk in any browser.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::episodes::policy_folder;
+use vla::{DeviceName, Vla};
+use evaluation::report::{self, Report, ReportOptions, Speech};
+use store::run;
+
+/// Episodes whose steps are written unless told otherwise: some 100 MB at the most.
+pub const EPISODES_MAX: usize = 1000;
+
+/// Builds the page of a run: tables, figures, and every episode with its candidates.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// The run's folder
+    run: PathBuf,
+    /// The report's folder [default: `report` in the run's folder]
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Folder of the policy that the run was made with; its tokenizer turns tokens into text
+    /// [default: the one that comes with rever]
+    #[arg(long)]
+    policy: Option<PathBuf>,
+    /// Episodes whose steps are written; those with videos come first
+    #[arg(long, default_value_t = EPISODES_MAX)]
+    episodes_max: usize,
+    /// Also write what was made to this file
+    #[arg(long)]
+    json: Option<PathBuf>,
+}
+
+/// Builds the report and says where it is.
+pub fn run(arguments: Arguments) -> Result<()> {
+    let out = arguments.out.unwrap_or_else(|| arguments.run.join("report"));
+    let policy = policy_folder(arguments.policy.as_ref())?;
+    let report = build(&arguments.run, &out, &policy, arguments.episodes_max)?;
+    if let Some(path) = &arguments.json {
+        let text = serde_json::to_string_pretty(&report)?;
+        std::fs::write(path, text + "\n")
+            .with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    println!("{}", describe(&report));
+    Ok(())
+}
+
+/// Builds the report of a run with the policy that made it.
+pub fn build(run: &Path, out: &Path, policy: &Path, episodes_max: usize) -> Result<Report> {
+    let header = run::read_header(run)?;
+    let policy = Policy::load(policy, DeviceName::Cpu)?;
+    let (expected, found) = (header.versions["policy"].as_str(), policy.digest());
+    ensure!(
+        expected == Some(found),
+        "policy: the run was made with {}, got {found}; tokens mean nothing to another policy (--policy)",
+        expected.unwrap_or("an unknown one")
+    );
+    let speak = |tokens: &[u32]| Speech {
+        text: policy.decode_text(tokens),
+        reasoning: policy.parse(tokens).ok().map(|parsed| parsed.reasoning),
+    };
+    let bar = ProgressBar::no_length().with_prefix("report");
+    let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {eta}");
+    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    let progress = |done: usize, total: usize| {
+        bar.set_length(total as u64);
+        bar.set_position(done as u64);
+    };
+    let report = report::build(&ReportOptions { run, out, episodes_max }, &speak, &progress);
+    bar.finish_and_clear();
+    report
+}
+
+/// Where the report is and what is in it.
+pub fn describe(report: &Report) -> String {
+    let page = report.page.canonicalize().unwrap_or_else(|_| report.page.clone());
+    format!(
+        "report: file://{}\n        {} episodes, {} with steps, {} with video, {:.1} MB",
+        page.display(),
+        report.episodes,
+        report.detailed,
+        report.videos,
+        report.bytes as f64 / 1e6
+    )
+}

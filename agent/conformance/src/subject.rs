@@ -1,0 +1,290 @@
+//! The server under test, and a conversation with one of its sessions.
+
+use std::time::Duration;
+
+use anyhow::{Context, Result, anyhow, bail, ensure};
+use protocol::{
+    Description, Dimension, Image, Observation, Open, PROTOCOL_VERSION, Reply, Request,
+    TaskDescription, Transition, decode, encode,
+};
+
+use serde::Serialize;
+use tokio::time::Instant;
+
+use store::plan::SeedRange;
+use runtime::wire::{Network, Probe};
+
+/// A reply takes no longer, resets included.
+const REPLY_WAIT: Duration = Duration::from_secs(30);
+/// A server that answers what it should drop does so within this time.
+pub const SILENCE: Duration = Duration::from_secs(1);
+/// How long sessions of a failed test may take to end, and how often that is looked at.
+const SETTLE_WAIT_MAX: Duration = Duration::from_secs(3);
+const SETTLE_LOOK: Duration = Duration::from_millis(50);
+/// Of the images that are asked for: small, so that the tests are quick, and of enough tiles that most stay as they are.
+const SIDE: u32 = 96;
+/// How far a dimension is moved, as a share of its range; without bounds, in its own unit.
+const SHARE: f32 = 0.02;
+
+/// The server under test.
+pub struct Subject<'a> {
+    pub network: &'a Network,
+    pub description: Description,
+}
+
+/// A session whose requests are numbered as they should be.
+pub struct Talk {
+    pub probe: Probe,
+    task: TaskDescription,
+    still: Vec<f32>,
+    moving: Vec<f32>,
+    /// Of the last request.
+    pub sequence: u64,
+    /// The last request as it was sent, and its reply as it came.
+    pub request: Vec<u8>,
+    pub reply: Vec<u8>,
+    /// Of the last observation: what a step's tiles are laid on.
+    image: Option<Image>,
+}
+
+impl<'a> Subject<'a> {
+    pub fn new(network: &'a Network, description: Description) -> Result<Subject<'a>> {
+        ensure!(
+            !description.tasks.is_empty(),
+            "server {} offers no tasks: there is nothing to test",
+            description.server
+        );
+        Ok(Subject { network, description })
+    }
+
+    /// Waits for the end of sessions that nobody holds any more.
+    pub async fn settle(&self) {
+        let mut looks = tokio::time::interval(SETTLE_LOOK);
+        let deadline = Instant::now() + SETTLE_WAIT_MAX;
+        while Instant::now() < deadline {
+            looks.tick().await;
+            let now = self.network.describe(&self.description.server).await;
+            if now.is_ok_and(|now| now.sessions <= self.description.sessions) {
+                break;
+            }
+        }
+    }
+
+    /// The task that sessions are opened for.
+    pub fn task(&self) -> &TaskDescription {
+        &self.description.tasks[0]
+    }
+
+    /// An image's side as the server allows it, which may have no images.
+    pub fn side(&self, wanted: u32) -> u32 {
+        wanted.min(self.description.image_side_max)
+    }
+
+    /// An action that does little.
+    pub fn still(&self) -> Vec<f32> {
+        self.task().action.iter().map(rest).collect()
+    }
+
+    /// An action that does something.
+    pub fn moving(&self) -> Vec<f32> {
+        let moved = |dimension: &Dimension| {
+            let rest = rest(dimension);
+            match (dimension.low, dimension.high) {
+                (_, Some(high)) if dimension.discrete => high,
+                (Some(low), Some(high)) => (rest + SHARE * (high - low)).min(high),
+                (_, high) => (rest + SHARE).min(high.unwrap_or(f32::MAX)),
+            }
+        };
+        self.task().action.iter().map(moved).collect()
+    }
+
+    pub fn open(&self) -> Open {
+        Open {
+            protocol: PROTOCOL_VERSION,
+            task: self.task().task.clone(),
+            variant: self.task().variant.clone(),
+            image_height: self.side(SIDE),
+            image_width: self.side(SIDE),
+            expert: false,
+            holder: "conformance".to_owned(),
+        }
+    }
+
+    /// A session that is held.
+    pub async fn talk(&self) -> Result<Talk> {
+        self.talk_with(&self.open()).await
+    }
+
+    pub async fn talk_with(&self, open: &Open) -> Result<Talk> {
+        let mut probe = Probe::open(self.network, &self.description.server, open).await?;
+        probe.hold().await?;
+        Ok(Talk {
+            probe,
+            task: self.task().clone(),
+            still: self.still(),
+            moving: self.moving(),
+            sequence: 0,
+            request: Vec::new(),
+            reply: Vec::new(),
+            image: None,
+        })
+    }
+
+    /// A session with an episode begun.
+    pub async fn episode(&self, index: u64) -> Result<Talk> {
+        let mut talk = self.talk().await?;
+        talk.reset(index).await?;
+        Ok(talk)
+    }
+}
+
+impl Talk {
+    /// Sends the next request and returns its reply.
+    pub async fn ask(&mut self, request: impl FnOnce(u64) -> Request) -> Result<Reply> {
+        let sequence = self.sequence + 1;
+        self.request = encode(&request(sequence))?;
+        self.reply = self.answer_to(&self.request.clone()).await?;
+        self.sequence = sequence;
+        let mut reply: Reply = decode(&self.reply)?;
+        ensure!(
+            reply.sequence() == sequence,
+            "expected a reply number {sequence}, got {} number {}",
+            reply.kind(),
+            reply.sequence()
+        );
+        self.look(&mut reply)?;
+        Ok(reply)
+    }
+
+    /// Completes the reply's image, if it has one, and keeps it.
+    fn look(&mut self, reply: &mut Reply) -> Result<()> {
+        let image = match reply {
+            Reply::Observed { observation, .. } | Reply::Restored { observation, .. } => {
+                &observation.image
+            }
+            Reply::Stepped { transition, changed_tiles, .. } => {
+                let image = &mut transition.observation.image;
+                if let Some(tiles) = changed_tiles.take() {
+                    let last = self.image.take().context("expected a whole image first")?;
+                    image.complete(&tiles, last).map_err(anyhow::Error::msg)?;
+                }
+                image
+            }
+            _ => return Ok(()),
+        };
+        self.image = Some(image.clone());
+        Ok(())
+    }
+
+    /// Sends any bytes and returns what comes back.
+    pub async fn answer_to(&mut self, bytes: &[u8]) -> Result<Vec<u8>> {
+        self.probe.send(bytes).await?;
+        let reply = self.probe.receive(REPLY_WAIT).await;
+        reply.with_context(|| {
+            format!("expected a reply within {} s, got none", REPLY_WAIT.as_secs())
+        })
+    }
+
+    /// Sends bytes that must be refused, and returns the reason.
+    pub async fn refusal_of(&mut self, bytes: &[u8], sequence: u64) -> Result<String> {
+        let bytes = self.answer_to(bytes).await?;
+        match decode(&bytes)? {
+            Reply::Refused { sequence: got, reason } if got == sequence => Ok(reason),
+            other => Err(anyhow!(
+                "expected Refused number {sequence}, got {} number {}",
+                other.kind(),
+                other.sequence()
+            )),
+        }
+    }
+
+    /// Sends the next request, which must be refused, and returns the reason.
+    pub async fn refused(&mut self, request: impl FnOnce(u64) -> Request) -> Result<String> {
+        match self.ask(request).await? {
+            Reply::Refused { reason, .. } => Ok(reason),
+            other => Err(anyhow!("expected Refused, got {}", other.kind())),
+        }
+    }
+
+    /// Begins an episode on a random layout.
+    pub async fn reset(&mut self, index: u64) -> Result<Observation> {
+        let request = self.resetting(None, SeedRange::Tuning.first() + index);
+        match self.ask(request).await? {
+            Reply::Observed { observation, .. } => Ok(observation),
+            other => bail!("expected Observed, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+
+    /// A `Reset` of the task under test.
+    pub fn resetting(
+        &self,
+        layout: Option<u32>,
+        seed: u64,
+    ) -> impl FnOnce(u64) -> Request + use<> {
+        let (task, variant) = (self.task.task.clone(), self.task.variant.clone());
+        move |sequence| Request::Reset { sequence, task, variant, layout, seed }
+    }
+
+    /// Steps with an action that does little.
+    pub async fn hold_still(&mut self) -> Result<Transition> {
+        self.step(self.still.clone()).await
+    }
+
+    /// Steps with an action that does something.
+    pub async fn go(&mut self) -> Result<Transition> {
+        self.step(self.moving.clone()).await
+    }
+
+    async fn step(&mut self, action: Vec<f32>) -> Result<Transition> {
+        match self.ask(|sequence| Request::Step { sequence, action }).await? {
+            Reply::Stepped { transition, .. } => Ok(transition),
+            other => bail!("expected Stepped, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+
+    pub async fn save(&mut self, slot: u32) -> Result<()> {
+        match self.ask(|sequence| Request::Save { sequence, slot }).await? {
+            Reply::Saved { .. } => Ok(()),
+            other => bail!("expected Saved, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+
+    pub async fn restore(&mut self, slot: u32) -> Result<Observation> {
+        match self.ask(|sequence| Request::Restore { sequence, slot }).await? {
+            Reply::Restored { observation, .. } => Ok(observation),
+            other => bail!("expected Restored, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+
+    pub async fn close(&mut self) -> Result<()> {
+        match self.ask(|sequence| Request::Close { sequence }).await? {
+            Reply::Closed { .. } => Ok(()),
+            other => bail!("expected Closed, got {}: {}", other.kind(), words(&other)),
+        }
+    }
+}
+
+/// Zero, or the nearest to it that the dimension has.
+fn rest(dimension: &Dimension) -> f32 {
+    0.0f32.max(dimension.low.unwrap_or(f32::MIN)).min(dimension.high.unwrap_or(f32::MAX))
+}
+
+fn words(reply: &Reply) -> &str {
+    match reply {
+        Reply::Refused { reason, .. } | Reply::Faulted { reason, .. } => reason,
+        _ => "",
+    }
+}
+
+/// The bytes of a message that our own codec would not send.
+pub fn unchecked(message: &impl Serialize) -> Vec<u8> {
+    rmp_serde::to_vec_named(message).expect("a message can be written")
+}
+
+/// Fails unless a reason names what it is about.
+pub fn names(reason: &str, parts: &[impl AsRef<str>]) -> Result<()> {
+    for part in parts.iter().map(AsRef::as_ref) {
+        ensure!(reason.contains(part), "expected a reason that names {part:?}, got {reason:?}");
+    }
+    Ok(())
+}

@@ -1,0 +1,18 @@
+//! What is computed from records: suites of episodes before a run, rates, gains and intervals after it.
+//!
+//! ```text
+//! Suite ─▶ EpisodePlans ─▶ (runtime) ─▶ records ─▶ Results ─▶ table, result file, report page
+//! ```
+
+// Which episodes.
+pub mod suite;
+
+// What came of them.
+pub mod calibration;
+pub mod results;
+pub mod statistics;
+
+// How it is shown.
+pub mod report;
+pub mod result_file;
+pub mod table;

@@ -1,0 +1,151 @@
+//! The steps of one episode as the page needs them: repeated phrases once, numbers short.
+
+use std::collections::HashMap;
+
+use anyhow::Context;
+use serde::Serialize;
+
+use store::record::{CandidateRecord, EpisodeRecord, StepRecord};
+
+use super::Speech;
+
+/// What `data/{id}.js` hands to the page.
+#[derive(Serialize)]
+pub struct Details {
+    id: String,
+    phrases: Vec<String>,
+    steps: Vec<Step>,
+}
+
+#[derive(Serialize)]
+struct Step {
+    chosen: Option<u32>,
+    /// One bit per statistic, in the page's order.
+    flags: u16,
+    decision_ms: f32,
+    candidates: Vec<Candidate>,
+}
+
+/// Well-formed candidates have an action and what they said, malformed ones the reason and the raw text.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Candidate {
+    Said {
+        score: Option<f64>,
+        log: f64,
+        action: [f64; 7],
+        /// Task, plan, subtask reasoning, subtask, move reasoning, move.
+        says: [usize; 6],
+        /// Name, left, top, right, bottom.
+        boxes: Vec<(usize, u16, u16, u16, u16)>,
+        gripper: Vec<[u16; 2]>,
+    },
+    Malformed {
+        score: Option<f64>,
+        log: f64,
+        malformed: usize,
+        text: usize,
+    },
+}
+
+/// Phrases by number, each kept once.
+#[derive(Default)]
+struct Phrases {
+    numbers: HashMap<String, usize>,
+    list: Vec<String>,
+}
+
+impl Phrases {
+    fn number(&mut self, phrase: String) -> usize {
+        *self.numbers.entry(phrase).or_insert_with_key(|phrase| {
+            self.list.push(phrase.clone());
+            self.list.len() - 1
+        })
+    }
+}
+
+impl Details {
+    /// Rebuilds what was said from the tokens of a record.
+    pub fn new(record: &EpisodeRecord, speak: &dyn Fn(&[u32]) -> Speech) -> anyhow::Result<Self> {
+        let mut phrases = Phrases::default();
+        let steps = record.steps.iter().map(|one| step(one, speak, &mut phrases));
+        let steps: Vec<Step> = steps
+            .collect::<anyhow::Result<_>>()
+            .with_context(|| format!("episode {}", record.identity.id()))?;
+        Ok(Self { id: record.identity.id(), phrases: phrases.list, steps })
+    }
+}
+
+fn step(
+    step: &StepRecord,
+    speak: &dyn Fn(&[u32]) -> Speech,
+    phrases: &mut Phrases,
+) -> anyhow::Result<Step> {
+    let candidates = step.candidates.iter().map(|one| candidate(one, speak(&one.tokens), phrases));
+    let statistics = &step.statistics;
+    let flags = [
+        statistics.is_grasped,
+        statistics.ever_grasped,
+        statistics.consecutive_grasp,
+        statistics.moved_correct_object,
+        statistics.moved_wrong_object,
+        statistics.source_on_target,
+        statistics.is_success,
+        statistics.ever_success,
+        statistics.released_success,
+    ];
+    Ok(Step {
+        chosen: step.chosen,
+        flags: flags.iter().rev().fold(0, |bits, flag| bits << 1 | u16::from(*flag)),
+        decision_ms: step.decision_ms,
+        candidates: candidates.collect::<anyhow::Result<_>>()?,
+    })
+}
+
+fn candidate(
+    record: &CandidateRecord,
+    speech: Speech,
+    phrases: &mut Phrases,
+) -> anyhow::Result<Candidate> {
+    let score = record.score.map(|score| rounded(score, 6));
+    let log = rounded(record.log_probability, 2);
+    let Some(action) = record.action else {
+        let reason = record.malformed.clone().context("a malformed candidate has a reason")?;
+        let malformed = phrases.number(reason);
+        return Ok(Candidate::Malformed {
+            score,
+            log,
+            malformed,
+            text: phrases.number(speech.text),
+        });
+    };
+    let reasoning = speech.reasoning.with_context(|| {
+        format!("a recorded well-formed candidate does not parse with this policy: {}", speech.text)
+    })?;
+    let boxes = reasoning.visible_objects.into_iter().map(|object| {
+        let [left, top, right, bottom] = object.bounding_box;
+        (phrases.number(object.name), left, top, right, bottom)
+    });
+    let boxes = boxes.collect();
+    let says = [
+        reasoning.task,
+        reasoning.plan,
+        reasoning.subtask_reasoning,
+        reasoning.subtask,
+        reasoning.move_reasoning,
+        reasoning.movement,
+    ];
+    Ok(Candidate::Said {
+        score,
+        log,
+        action: action.map(|value| rounded(value, 5)),
+        says: says.map(|phrase| phrases.number(phrase)),
+        boxes,
+        gripper: reasoning.gripper_position,
+    })
+}
+
+fn rounded(value: f32, digits: i32) -> f64 {
+    let scale = 10f64.powi(digits);
+    (f64::from(value) * scale).round() / scale
+}

@@ -1,0 +1,214 @@
+//! How well a verifier separates successes from failures on episodes it was not fitted to.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::probability;
+use evaluation::calibration::{BINS, ReliabilityBin, brier_score, calibration_error, reliability};
+use evaluation::statistics::auroc;
+
+/// Steps that count as the beginning or the end of an episode.
+pub const PHASE_STEPS: usize = 10;
+
+/// Scored samples with their truth; the lists run in parallel.
+#[derive(Clone, Debug, Default)]
+pub struct HeldOut {
+    /// The verifier's logits.
+    pub logits: Vec<f32>,
+    /// Whether the sample's episode succeeded.
+    pub labels: Vec<bool>,
+    /// The sample's task.
+    pub tasks: Vec<String>,
+    /// The sample's control step, counted from 0.
+    pub steps: Vec<usize>,
+    /// How many control steps its episode has.
+    pub episode_steps: Vec<usize>,
+}
+
+/// Quality on held-out samples.
+///
+/// Training stops by the held-out loss, so these figures are slightly kind to the verifier.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Metrics {
+    /// Class-weighted cross-entropy, in nats; `None` without samples.
+    pub loss: Option<f64>,
+    /// All steps.
+    pub auroc: Discrimination,
+    /// The first [`PHASE_STEPS`] steps, where choosing well still matters most.
+    pub auroc_first_steps: Discrimination,
+    /// The steps between.
+    pub auroc_middle_steps: Discrimination,
+    /// The last [`PHASE_STEPS`] steps, where the outcome can often be seen.
+    pub auroc_last_steps: Discrimination,
+    /// Mean squared difference of probability and outcome.
+    pub brier_score: Option<f64>,
+    /// Expected calibration error over `reliability`.
+    pub calibration_error: Option<f64>,
+    /// The reliability diagram.
+    pub reliability: Vec<ReliabilityBin>,
+}
+
+/// AUROC in three views; `None` where a class is missing.
+///
+/// The pooled value misleads: knowing which task is easy already raises it, and that chooses nothing among the candidates
+/// of one step. The macro average is free of that, yet it still rewards recognising an easy layout.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Discrimination {
+    /// Over the samples of all tasks together.
+    pub pooled: Option<f64>,
+    /// The mean over the tasks that have a value.
+    pub macro_average: Option<f64>,
+    /// Within each task.
+    pub tasks: BTreeMap<String, Option<f64>>,
+}
+
+impl Metrics {
+    /// Measures scored samples; `positive_share` is the share of positives that gave the training its class weights.
+    pub fn measure(held_out: &HeldOut, positive_share: f64) -> Metrics {
+        let probabilities: Vec<f32> =
+            held_out.logits.iter().map(|logit| probability(*logit)).collect();
+        let reliability = reliability(&probabilities, &held_out.labels, BINS);
+        Metrics {
+            loss: weighted_loss(&held_out.logits, &held_out.labels, positive_share),
+            auroc: held_out.discrimination(|_| true),
+            auroc_first_steps: held_out
+                .discrimination(|index| held_out.phase(index) == Phase::First),
+            auroc_middle_steps: held_out
+                .discrimination(|index| held_out.phase(index) == Phase::Middle),
+            auroc_last_steps: held_out.discrimination(|index| held_out.phase(index) == Phase::Last),
+            brier_score: brier_score(&probabilities, &held_out.labels),
+            calibration_error: calibration_error(&reliability),
+            reliability,
+        }
+    }
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    First,
+    Middle,
+    Last,
+}
+
+impl HeldOut {
+    fn phase(&self, index: usize) -> Phase {
+        let step = self.steps[index];
+        if step < PHASE_STEPS {
+            Phase::First
+        } else if step + PHASE_STEPS < self.episode_steps[index] {
+            Phase::Middle
+        } else {
+            Phase::Last
+        }
+    }
+
+    fn discrimination(&self, counts: impl Fn(usize) -> bool) -> Discrimination {
+        let area = |task: Option<&str>| {
+            let samples = (0..self.labels.len()).filter(|index| counts(*index));
+            let samples =
+                samples.filter(|index| task.is_none_or(|task| self.tasks[*index] == task));
+            let (scores, labels): (Vec<f32>, Vec<bool>) =
+                samples.map(|index| (self.logits[index], self.labels[index])).unzip();
+            auroc(&scores, &labels)
+        };
+        let mut tasks: BTreeMap<String, Option<f64>> =
+            self.tasks.iter().map(|task| (task.clone(), None)).collect();
+        tasks.iter_mut().for_each(|(task, value)| *value = area(Some(task)));
+        let values: Vec<f64> = tasks.values().copied().flatten().collect();
+        let macro_average =
+            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
+        Discrimination { pooled: area(None), macro_average, tasks }
+    }
+}
+
+/// Equation 4 over scored samples, in f64; the training loss is the same in tensors. `None` without samples.
+///
+/// With D+ the positives among all samples D, w+ = |D| / 2|D+| and w- = |D| / 2|D-|, and the loss is the mean over D of
+/// w+ ln(1 + e^-z) for positives and w- ln(1 + e^z) for negatives, z being the logit. The mean runs over all of D: only then
+/// do both classes contribute equally, which is what the paper says the weights are for.
+pub fn weighted_loss(logits: &[f32], labels: &[bool], positive_share: f64) -> Option<f64> {
+    assert_eq!(logits.len(), labels.len(), "one label per logit");
+    let (positive, negative) = (0.5 / positive_share, 0.5 / (1.0 - positive_share));
+    let losses = logits.iter().zip(labels).map(|(logit, label)| {
+        let logit = f64::from(*logit);
+        if *label { positive * softplus(-logit) } else { negative * softplus(logit) }
+    });
+    (!logits.is_empty()).then(|| losses.sum::<f64>() / logits.len() as f64)
+}
+
+/// ln(1 + e^x) without overflow: for large x it is x plus a vanishing rest.
+fn softplus(x: f64) -> f64 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn held_out(rows: &[(f32, bool, &str, usize, usize)]) -> HeldOut {
+        HeldOut {
+            logits: rows.iter().map(|row| row.0).collect(),
+            labels: rows.iter().map(|row| row.1).collect(),
+            tasks: rows.iter().map(|row| row.2.to_owned()).collect(),
+            steps: rows.iter().map(|row| row.3).collect(),
+            episode_steps: rows.iter().map(|row| row.4).collect(),
+        }
+    }
+
+    #[test]
+    fn a_score_that_only_knows_the_task_looks_good_when_pooled() {
+        // Task a succeeds in three of four samples, task b in one of four; the score tells the tasks apart and nothing else.
+        let rows: Vec<_> = (0..8)
+            .map(|i| if i < 4 { (1.0, i != 0, "a", 0, 60) } else { (-1.0, i == 4, "b", 0, 60) })
+            .collect();
+        let auroc = Metrics::measure(&held_out(&rows), 0.5).auroc;
+        assert_eq!(auroc.pooled, Some(0.75));
+        assert_eq!(auroc.macro_average, Some(0.5));
+        assert_eq!(
+            auroc.tasks,
+            BTreeMap::from([("a".to_owned(), Some(0.5)), ("b".to_owned(), Some(0.5))])
+        );
+    }
+
+    #[test]
+    fn phases_are_the_first_ten_and_the_last_ten_steps() {
+        let mut rows = Vec::new();
+        for step in 0..30 {
+            // The score is wrong in the first ten steps, silent in the middle, right in the last ten.
+            let strength = if step < 10 {
+                -1.0
+            } else if step < 20 {
+                0.0
+            } else {
+                1.0
+            };
+            rows.push((strength, true, "a", step, 30));
+            rows.push((-strength, false, "a", step, 30));
+        }
+        let metrics = Metrics::measure(&held_out(&rows), 0.5);
+        assert_eq!(metrics.auroc_first_steps.pooled, Some(0.0));
+        assert_eq!(metrics.auroc_middle_steps.pooled, Some(0.5));
+        assert_eq!(metrics.auroc_last_steps.pooled, Some(1.0));
+        assert_eq!(metrics.auroc.pooled, Some(0.5));
+    }
+
+    #[test]
+    fn a_task_with_one_class_has_no_value_and_does_not_spoil_the_average() {
+        let rows = [(1.0, true, "a", 0, 60), (0.0, false, "a", 0, 60), (0.5, true, "b", 0, 60)];
+        let metrics = Metrics::measure(&held_out(&rows), 0.5);
+        assert_eq!(metrics.auroc.tasks["b"], None);
+        assert_eq!(metrics.auroc.macro_average, Some(1.0));
+        let empty = Metrics::measure(&HeldOut::default(), 0.5);
+        assert_eq!((empty.loss, empty.auroc.pooled, empty.calibration_error), (None, None, None));
+    }
+
+    #[test]
+    fn the_loss_of_an_undecided_verifier_is_ln_2_whatever_the_classes() {
+        let labels: Vec<bool> = (0..10).map(|i| i < 7).collect();
+        let loss = weighted_loss(&[0.0; 10], &labels, 0.7).expect("samples");
+        assert!((loss - 2.0_f64.ln()).abs() < 1e-12);
+    }
+}

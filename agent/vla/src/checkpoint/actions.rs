@@ -1,0 +1,133 @@
+//! Action tokens: OpenVLA's bins, turned into the environment's metres, rotation vector and gripper.
+
+use crate::checkpoint::config::{ACTION_LENGTH, ActionScale};
+
+/// The token ids of actions and what they mean.
+pub struct ActionBins {
+    vocabulary: usize,
+    bins: usize,
+    scale: ActionScale,
+}
+
+impl ActionBins {
+    /// Bin digit d (1 to `bins`) has id `vocabulary` - d.
+    pub fn new(vocabulary: usize, bins: usize, scale: ActionScale) -> ActionBins {
+        ActionBins { vocabulary, bins, scale }
+    }
+
+    /// Whether an id stands for an action bin.
+    pub fn contains(&self, id: u32) -> bool {
+        (self.vocabulary - self.bins..self.vocabulary).contains(&(id as usize))
+    }
+
+    /// The centre of an id's bin in -1..1. There is one centre fewer than ids: the last two share.
+    pub fn centre(&self, id: u32) -> f64 {
+        assert!(self.contains(id), "action id: expected one of the last {}, got {id}", self.bins);
+        let digit = self.vocabulary - id as usize;
+        let centres = self.bins - 1;
+        let index = (digit - 1).min(centres - 1);
+        -1.0 + (2 * index + 1) as f64 / centres as f64
+    }
+
+    /// Metres, rotation vector in radians, and the gripper: +1 open, -1 closed.
+    pub fn decode(&self, ids: [u32; ACTION_LENGTH]) -> [f32; ACTION_LENGTH] {
+        let physical: [f64; ACTION_LENGTH] = std::array::from_fn(|index| {
+            let centre = self.centre(ids[index]);
+            let (low, high) = (self.scale.q01[index], self.scale.q99[index]);
+            if self.scale.mask[index] { 0.5 * (centre + 1.0) * (high - low) + low } else { centre }
+        });
+        let [x, y, z, roll, pitch, yaw, gripper] = physical;
+        let rotation = rotation_vector(roll, pitch, yaw);
+        let gripper = if gripper > 0.5 { 1.0 } else { -1.0 };
+        [x, y, z, rotation[0], rotation[1], rotation[2], gripper].map(|number| number as f32)
+    }
+
+    /// What counts as one unit of each number of an action: its range, and 2 for the gripper.
+    pub fn units(&self) -> [f32; ACTION_LENGTH] {
+        let mut units = [2.0; ACTION_LENGTH];
+        for (index, unit) in units.iter_mut().enumerate().take(ACTION_LENGTH - 1) {
+            if self.scale.mask[index] {
+                *unit = (self.scale.q99[index] - self.scale.q01[index]) as f32;
+            }
+        }
+        units
+    }
+}
+
+/// Axis times angle of a turn about fixed x by roll, then fixed y by pitch, then fixed z by yaw.
+pub fn rotation_vector(roll: f64, pitch: f64, yaw: f64) -> [f64; 3] {
+    let (sr, cr) = (roll / 2.0).sin_cos();
+    let (sp, cp) = (pitch / 2.0).sin_cos();
+    let (sy, cy) = (yaw / 2.0).sin_cos();
+    let mut w = cr * cp * cy + sr * sp * sy;
+    let mut axis =
+        [sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy];
+    if w < 0.0 {
+        // The same turn, by the shorter way.
+        w = -w;
+        axis = axis.map(|number| -number);
+    }
+    let sine = axis.iter().map(|number| number * number).sum::<f64>().sqrt();
+    // Near zero the angle is twice its half's sine.
+    let factor = if sine < 1e-9 { 2.0 } else { 2.0 * sine.atan2(w) / sine };
+    axis.map(|number| number * factor)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn openvla() -> ActionBins {
+        let scale = ActionScale {
+            q01: [-0.02, -0.04, -0.03, -0.1, -0.1, -0.2, 0.0],
+            q99: [0.03, 0.04, 0.04, 0.1, 0.1, 0.2, 1.0],
+            mask: [true, true, true, true, true, true, false],
+        };
+        ActionBins::new(32000, 256, scale)
+    }
+
+    #[test]
+    fn there_are_255_centres_and_the_last_two_ids_share_one() {
+        let bins = openvla();
+        assert_eq!(bins.centre(31999), -1.0 + 1.0 / 255.0);
+        assert_eq!(bins.centre(31744), bins.centre(31745));
+        assert_eq!(bins.centre(31745), 1.0 - 1.0 / 255.0);
+        let mut centres: Vec<f64> = (31744..32000).map(|id| bins.centre(id)).collect();
+        centres.dedup();
+        assert_eq!(centres.len(), 255);
+        assert!(centres.windows(2).all(|pair| (pair[0] - pair[1] - 2.0 / 255.0).abs() < 1e-12));
+        assert!(!bins.contains(31743) && !bins.contains(32000));
+    }
+
+    #[test]
+    fn extreme_ids_decode_to_the_ends_of_the_range() {
+        let action = openvla().decode([31999, 31745, 31872, 31872, 31872, 31872, 31745]);
+        // np.linspace(-1, 1, 256): centre 0 is -254/255, centre 127 is 0
+        assert!((f64::from(action[0]) - (-0.02 + 0.05 * 0.5 / 255.0)).abs() < 1e-8);
+        assert!((f64::from(action[1]) - (0.04 - 0.08 * 0.5 / 255.0)).abs() < 1e-8);
+        assert!((f64::from(action[2]) - 0.005).abs() < 1e-8);
+        assert_eq!(action[3..6], [0.0; 3]);
+        assert_eq!(action[6], 1.0);
+        assert_eq!(openvla().decode([31872; 7])[6], -1.0);
+    }
+
+    #[test]
+    fn rotation_vectors_follow_fixed_axes() {
+        fn check(angles: [f64; 3], expected: [f64; 3]) {
+            let got = rotation_vector(angles[0], angles[1], angles[2]);
+            for (got, expected) in got.iter().zip(expected) {
+                assert!((got - expected).abs() < 1e-9, "{angles:?}: {got} is not {expected}");
+            }
+        }
+        check([0.0; 3], [0.0; 3]);
+        check([0.3, 0.0, 0.0], [0.3, 0.0, 0.0]);
+        check([0.0, -0.2, 0.0], [0.0, -0.2, 0.0]);
+        check([0.0, 0.0, 3.0], [0.0, 0.0, 3.0]);
+        // numpy: matrix = z(yaw) @ y(pitch) @ x(roll); angle = acos((trace - 1) / 2); the axis is
+        // [m21 - m12, m02 - m20, m10 - m01] / (2 sin angle).
+        let expected = [0.06892461388206564, 0.21322592695788625, 0.2887489392286753];
+        check([0.1, 0.2, 0.3], expected);
+        let expected = [-0.20651554091555197, 1.1297979891665737, 0.20651554091555197];
+        check([3.0, 2.0, -3.0], expected);
+    }
+}

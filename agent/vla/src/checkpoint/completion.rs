@@ -1,0 +1,83 @@
+//! Completions read back: the text of tokens, candidates' reasoning and action, confidence. Needs no weights.
+
+use std::fs::File;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use decision::{ActionSpace, Malformed, Parsed};
+use sha2::{Digest, Sha256};
+
+use super::actions::ActionBins;
+use super::config::{ACTION_LENGTH, Config};
+use super::prompt::Prompter;
+use super::weights::weight_files;
+use super::{confidence, parse};
+
+/// What a checkpoint's configuration and tokenizer say about its completions.
+pub struct CompletionParser {
+    pub(crate) config: Config,
+    pub(crate) prompter: Prompter,
+    pub(crate) bins: ActionBins,
+    digest: String,
+}
+
+impl CompletionParser {
+    /// Reads config.json and tokenizer.json of a checkpoint's folder, and the digest of all its files.
+    pub fn load(directory: &Path) -> Result<CompletionParser> {
+        let load = || -> Result<CompletionParser> {
+            let config = Config::load(&directory.join("config.json"))?;
+            let prompter = Prompter::load(&directory.join("tokenizer.json"), &config)?;
+            let scale = config.action_scale.clone();
+            let bins = ActionBins::new(config.vocabulary, config.action_bins, scale);
+            let digest = digest(directory)?;
+            Ok(CompletionParser { config, prompter, bins, digest })
+        };
+        load().with_context(|| format!("cannot load the policy in {}", directory.display()))
+    }
+
+    /// SHA-256 of weights, config and tokenizer, in hexadecimal.
+    pub fn digest(&self) -> &str {
+        &self.digest
+    }
+
+    /// Length of a candidate's hidden state.
+    pub fn hidden_size(&self) -> usize {
+        self.config.text.hidden_size
+    }
+
+    /// How the numbers of the checkpoint's actions compare.
+    pub fn action_space(&self) -> ActionSpace {
+        ActionSpace { scale: self.bins.units().to_vec(), gripper: Some(ACTION_LENGTH - 1) }
+    }
+
+    /// The text of a candidate's tokens.
+    pub fn text(&self, tokens: &[u32]) -> String {
+        self.prompter.text(tokens)
+    }
+
+    /// Reads a candidate's tokens (without `</s>`) as reasoning and action.
+    pub fn parse(&self, tokens: &[u32]) -> Result<Parsed, Malformed> {
+        parse::parse(tokens, self.config.reasoning, &self.bins, &self.prompter)
+    }
+
+    /// How sure the policy was of each part of a candidate; one log-probability per token.
+    pub fn confidence(&self, tokens: &[u32], log_probabilities: &[f32]) -> Vec<f32> {
+        confidence::confidence(tokens, log_probabilities, &self.bins, &self.prompter)
+    }
+}
+
+/// Of all files in turn, each after its length; read as a stream, for weights may be larger than the memory.
+fn digest(directory: &Path) -> Result<String> {
+    let mut hasher = Sha256::new();
+    let mut files = vec![directory.join("config.json"), directory.join("tokenizer.json")];
+    files.extend(weight_files(directory)?);
+    for path in files {
+        let mut read = || -> std::io::Result<()> {
+            let mut file = File::open(&path)?;
+            hasher.update(file.metadata()?.len().to_le_bytes());
+            std::io::copy(&mut file, &mut hasher).map(drop)
+        };
+        read().with_context(|| format!("cannot read {}", path.display()))?;
+    }
+    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
+}

@@ -1,0 +1,9 @@
+//! What a checkpoint's files say: configuration, tokenizer, prompt, action bins, weights, completions.
+
+pub mod actions;
+pub mod completion;
+pub mod confidence;
+pub mod config;
+pub mod parse;
+pub mod prompt;
+pub mod weights;

@@ -1,0 +1,128 @@
+//! A checkpoint's tensors by name; what is missing, misshapen or left over is an error.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail, ensure};
+use candle_core::{DType, Device, Tensor};
+use serde::Deserialize;
+
+use crate::kernels::backend::Backend;
+
+/// Endings of names in a vision tower that no output depends on, besides blocks that are never run.
+const DEAD_TOWER_PARTS: [&str; 2] = ["norm.", "attn_pool."];
+
+/// Tensors not yet taken by a layer.
+pub struct Weights {
+    tensors: HashMap<String, Tensor>,
+    device: Device,
+    /// How the layers made of these weights compute.
+    pub backend: Backend,
+}
+
+/// A part of the checkpoint by the beginning of its names.
+pub struct Part<'a> {
+    weights: &'a mut Weights,
+    name: String,
+}
+
+/// The file that says which shard holds which tensor, in checkpoints of several shards.
+#[derive(Deserialize)]
+struct Index {
+    weight_map: HashMap<String, String>,
+}
+
+impl Weights {
+    /// Reads all tensors of a checkpoint's files.
+    pub fn load(files: &[PathBuf], device: &Device, backend: Backend) -> Result<Weights> {
+        let mut tensors = HashMap::new();
+        for file in files {
+            let name = || format!("cannot read {}", file.display());
+            tensors.extend(candle_core::safetensors::load(file, device).with_context(name)?);
+        }
+        Ok(Weights { tensors, device: device.clone(), backend })
+    }
+
+    /// The part of the checkpoint whose names begin with `name`.
+    pub fn part(&mut self, name: &str) -> Part<'_> {
+        Part { weights: self, name: name.to_string() }
+    }
+
+    /// Drops weights of known dead parts and returns how many; any other left over is an error.
+    pub fn finish(self, towers: &[(&str, usize)]) -> Result<usize> {
+        let (dead, unexpected): (Vec<&String>, Vec<&String>) =
+            self.tensors.keys().partition(|name| is_dead(name, towers));
+        if let Some(name) = unexpected.iter().min() {
+            bail!("weights: {} unexpected, the first is {name}", unexpected.len());
+        }
+        Ok(dead.len())
+    }
+}
+
+/// The files of a checkpoint: one, or the shards that the index names.
+pub fn weight_files(directory: &Path) -> Result<Vec<PathBuf>> {
+    let single = directory.join("model.safetensors");
+    if single.exists() {
+        return Ok(vec![single]);
+    }
+    let path = directory.join("model.safetensors.index.json");
+    let text = std::fs::read_to_string(&path).with_context(|| {
+        format!("weights: expected {} or {}, got neither", single.display(), path.display())
+    })?;
+    let index: Index = serde_json::from_str(&text)
+        .with_context(|| format!("cannot understand {}", path.display()))?;
+    let mut names: Vec<&String> = index.weight_map.values().collect();
+    names.sort();
+    names.dedup();
+    Ok(names.into_iter().map(|name| directory.join(name)).collect())
+}
+
+/// `towers` are names of vision towers with the number of blocks that are run.
+fn is_dead(name: &str, towers: &[(&str, usize)]) -> bool {
+    towers.iter().any(|(tower, blocks_used)| {
+        let Some(rest) = name.strip_prefix(tower).and_then(|rest| rest.strip_prefix('.')) else {
+            return false;
+        };
+        let block = rest.strip_prefix("blocks.").and_then(|rest| rest.split('.').next());
+        match block.and_then(|index| index.parse::<usize>().ok()) {
+            Some(index) => index >= *blocks_used,
+            None => DEAD_TOWER_PARTS.iter().any(|part| rest.starts_with(part)),
+        }
+    })
+}
+
+impl Part<'_> {
+    /// The part of this part whose names go on with `name`.
+    pub fn part(&mut self, name: &str) -> Part<'_> {
+        Part { name: self.full_name(name), weights: self.weights }
+    }
+
+    /// Takes a tensor out as f32; its shape must be as given.
+    pub fn take(&mut self, name: &str, shape: &[usize]) -> Result<Tensor> {
+        let name = self.full_name(name);
+        let Some(tensor) = self.weights.tensors.remove(&name) else {
+            bail!("weights: {name} is missing, expected shape {shape:?}");
+        };
+        ensure!(tensor.dims() == shape, "{name}: expected {shape:?}, got {:?}", tensor.dims());
+        let kind = tensor.dtype();
+        ensure!(
+            [DType::F32, DType::F16, DType::BF16].contains(&kind),
+            "{name}: expected 16- or 32-bit floating point numbers, got {kind:?}"
+        );
+        Ok(tensor.to_dtype(DType::F32)?)
+    }
+
+    /// How the layers made of these weights compute.
+    pub fn backend(&self) -> Backend {
+        self.weights.backend
+    }
+
+    /// Where the tensors are.
+    pub fn device(&self) -> Device {
+        self.weights.device.clone()
+    }
+
+    fn full_name(&self, name: &str) -> String {
+        if self.name.is_empty() { name.to_string() } else { format!("{}.{name}", self.name) }
+    }
+}

@@ -1,0 +1,148 @@
+//! The decode loop: one prefill per session, then one token at a time for all candidates together.
+//!
+//! Candidates of a session that have drawn the same tokens so far share their rows of work.
+
+use std::collections::HashMap;
+
+use anyhow::Result;
+use candle_core::Tensor;
+use rayon::prelude::*;
+
+use crate::checkpoint::actions::ActionBins;
+use crate::checkpoint::parse::is_complete;
+use crate::network::forward::{Context, Network};
+use crate::generate::sampling::{Draw, Stream, draw};
+
+/// Positions of a tail to make room for at once; tails grow beyond it when they must.
+const TAIL_CAPACITY: usize = 64;
+
+/// One session's prompt and how to continue it.
+pub struct Continuation<'a> {
+    pub context: Context<'a>,
+    pub candidates: usize,
+    pub temperature: f32,
+    pub seed: u64,
+    /// A completion that has not ended by then is cut, one token later.
+    pub tokens_max: usize,
+}
+
+/// When a completion ends.
+pub struct Limits<'a> {
+    pub bins: &'a ActionBins,
+    /// Ids from here on are padding of the embedding and are never drawn.
+    pub vocabulary: usize,
+    pub end: u32,
+}
+
+/// A completion under way or done.
+pub struct Completion {
+    pub session: usize,
+    /// Without `</s>`.
+    pub tokens: Vec<u32>,
+    pub log_probability: f64,
+    /// Of each token.
+    pub log_probabilities: Vec<f32>,
+    /// Of the last token.
+    pub hidden: Vec<f32>,
+    temperature: f32,
+    stream: Stream,
+    tokens_max: usize,
+    /// The row that computes it; several completions of a session share one while they agree.
+    row: Option<usize>,
+}
+
+/// A row to be computed next: one more token onto an earlier row.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+struct Row {
+    parent: usize,
+    token: u32,
+}
+
+/// All completions, session by session and candidate by candidate.
+pub fn complete(
+    network: &Network,
+    sessions: &[Continuation<'_>],
+    limits: &Limits<'_>,
+) -> Result<Vec<Completion>> {
+    let contexts: Vec<Context<'_>> = sessions.iter().map(|session| session.context).collect();
+    let (prefix, hidden) = network.prefill_all(&contexts)?;
+    let decoder = &network.decoder;
+    let mut completions = start(sessions);
+    let mut rows = extend(&mut completions, &hidden, &decoder.logits(&hidden)?, limits)?;
+    // At first a row's parent is its session itself.
+    let parents: Vec<usize> = rows.iter().map(|row| row.parent).collect();
+    let mut tail = decoder.tails(parents, TAIL_CAPACITY);
+    while !rows.is_empty() {
+        let ids: Vec<u32> = rows.iter().map(|row| row.token).collect();
+        let hidden = decoder.step(&ids, &prefix, &mut tail)?;
+        let next = extend(&mut completions, &hidden, &decoder.logits(&hidden)?, limits)?;
+        let parents: Vec<usize> = next.iter().map(|row| row.parent).collect();
+        if parents.len() != rows.len() || !parents.is_sorted_by(|a, b| a < b) {
+            tail.fork(&parents)?;
+        }
+        rows = next;
+    }
+    Ok(completions)
+}
+
+fn start(sessions: &[Continuation<'_>]) -> Vec<Completion> {
+    let completions = sessions.iter().enumerate().flat_map(|(index, session)| {
+        (0..session.candidates).map(move |candidate| Completion {
+            session: index,
+            tokens: Vec::new(),
+            log_probability: 0.0,
+            log_probabilities: Vec::new(),
+            hidden: Vec::new(),
+            temperature: session.temperature,
+            stream: Stream::new(session.seed, candidate),
+            tokens_max: session.tokens_max,
+            row: Some(index),
+        })
+    });
+    completions.collect()
+}
+
+/// Draws the next token of every completion under way; the rows that must be computed for them.
+fn extend(
+    completions: &mut [Completion],
+    hidden: &Tensor,
+    logits: &Tensor,
+    limits: &Limits<'_>,
+) -> Result<Vec<Row>> {
+    let hidden: Vec<Vec<f32>> = hidden.to_vec2()?;
+    let logits: Vec<Vec<f32>> = logits.to_vec2()?;
+    let next = completions.par_iter_mut().map(|completion| {
+        let Some(row) = completion.row else { return Ok(None) };
+        completion.hidden.clone_from(&hidden[row]);
+        let token = completion.draw(&logits[row][..limits.vocabulary], limits)?;
+        Ok(token.map(|token| Row { parent: row, token }))
+    });
+    let next = next.collect::<Result<Vec<Option<Row>>>>()?;
+    // Completions of one session that agree so far are computed once.
+    let (mut rows, mut known) = (Vec::new(), HashMap::new());
+    for (completion, next) in completions.iter_mut().zip(next) {
+        completion.row = next.map(|row| {
+            *known.entry(row).or_insert_with(|| {
+                rows.push(row);
+                rows.len() - 1
+            })
+        });
+    }
+    Ok(rows)
+}
+
+impl Completion {
+    /// The next token, or none when the completion is done.
+    fn draw(&mut self, logits: &[f32], limits: &Limits<'_>) -> Result<Option<u32>> {
+        let Draw { token, log_probability } =
+            draw(logits, self.temperature, self.stream.uniform())?;
+        self.log_probability += log_probability;
+        if token == limits.end {
+            return Ok(None);
+        }
+        self.tokens.push(token);
+        self.log_probabilities.push(log_probability as f32);
+        let done = self.tokens.len() > self.tokens_max || is_complete(&self.tokens, limits.bins);
+        Ok(if done { None } else { Some(token) })
+    }
+}

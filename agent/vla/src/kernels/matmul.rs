@@ -1,0 +1,254 @@
+//! The product of activation rows with a packed weight; a row's bits do not depend on other rows.
+//!
+//! Every output is one chain of fused multiply-adds over the inputs in order, whatever tile
+//! computes it. So one row, sixteen sessions and any number of threads give the same bits.
+
+use std::ops::Range;
+
+use half::bf16;
+use rayon::prelude::*;
+
+use crate::kernels::tile::{self, PANEL, Stored, Vectors};
+
+/// Rows per task: with 256 inputs they stay in the second-level cache while panels stream by.
+const TASK_ROWS: usize = 96;
+/// Multiply-adds per task below which another thread costs more than it brings.
+const TASK_WORK_MIN: usize = 1 << 17;
+
+/// A weight of `outputs` x `inputs` stored in panels of sixteen outputs, input by input.
+pub struct PackedWeight {
+    outputs: usize,
+    inputs: usize,
+    panels: Panels,
+}
+
+/// Numbers in the fewest bits that keep every one of them.
+enum Panels {
+    Half(Vec<bf16>),
+    Full(Vec<f32>),
+}
+
+impl PackedWeight {
+    /// Packs a row-major weight as checkpoints store it: one row per output.
+    pub fn pack(weight: &[f32], outputs: usize, inputs: usize) -> PackedWeight {
+        assert_eq!(weight.len(), outputs * inputs, "weight of {outputs} x {inputs}");
+        let is_half = weight.iter().all(|&value| bf16::from_f32(value).to_f32() == value);
+        let panels = if is_half {
+            Panels::Half(panels(weight, outputs, inputs, bf16::from_f32))
+        } else {
+            Panels::Full(panels(weight, outputs, inputs, |value| value))
+        };
+        PackedWeight { outputs, inputs, panels }
+    }
+
+    /// Outputs per row.
+    pub fn outputs(&self) -> usize {
+        self.outputs
+    }
+
+    /// Bytes of the panels.
+    pub fn bytes(&self) -> usize {
+        match &self.panels {
+            Panels::Half(panels) => size_of_val(panels.as_slice()),
+            Panels::Full(panels) => size_of_val(panels.as_slice()),
+        }
+    }
+
+    /// `rows` x weight + `bias` + `residual`, row-major.
+    pub fn multiply(
+        &self,
+        rows: &[f32],
+        bias: Option<&[f32]>,
+        residual: Option<&[f32]>,
+    ) -> Vec<f32> {
+        self.multiply_with(Vectors::widest(), rows, bias, residual)
+    }
+
+    fn multiply_with(
+        &self,
+        vectors: Vectors,
+        rows: &[f32],
+        bias: Option<&[f32]>,
+        residual: Option<&[f32]>,
+    ) -> Vec<f32> {
+        let (inputs, outputs) = (self.inputs, self.outputs);
+        let count = rows.len() / inputs;
+        assert_eq!(rows.len(), count * inputs, "rows of {inputs} inputs");
+        let length = count * outputs;
+        assert!(bias.is_none_or(|bias| bias.len() == outputs));
+        assert!(residual.is_none_or(|residual| residual.len() == length));
+        let mut output: Vec<f32> = Vec::with_capacity(length);
+        let target = Output { start: output.as_mut_ptr(), outputs, bias, residual };
+        match &self.panels {
+            Panels::Half(panels) => Product { inputs, panels, rows, target }.run(vectors, count),
+            Panels::Full(panels) => Product { inputs, panels, rows, target }.run(vectors, count),
+        }
+        // SAFETY: the tasks of `run` cover every row and every panel, so all numbers are written.
+        unsafe { output.set_len(length) };
+        output
+    }
+}
+
+/// Panel after panel; the last one is filled up with zeros.
+fn panels<W: Stored>(
+    weight: &[f32],
+    outputs: usize,
+    inputs: usize,
+    convert: impl Fn(f32) -> W,
+) -> Vec<W> {
+    let mut panels = vec![convert(0.0); outputs.div_ceil(PANEL) * PANEL * inputs];
+    for (output, row) in weight.chunks_exact(inputs).enumerate() {
+        let panel = &mut panels[output / PANEL * PANEL * inputs..];
+        for (input, &value) in row.iter().enumerate() {
+            panel[input * PANEL + output % PANEL] = convert(value);
+        }
+    }
+    panels
+}
+
+/// One product under way.
+pub struct Product<'a, W> {
+    inputs: usize,
+    panels: &'a [W],
+    rows: &'a [f32],
+    target: Output<'a>,
+}
+
+/// Where tiles are written, and what is added there; tasks own disjoint rectangles of it.
+struct Output<'a> {
+    start: *mut f32,
+    outputs: usize,
+    bias: Option<&'a [f32]>,
+    residual: Option<&'a [f32]>,
+}
+
+// SAFETY: no two tasks write the same number, and nobody reads before all are done.
+unsafe impl Send for Output<'_> {}
+// SAFETY: as above.
+unsafe impl Sync for Output<'_> {}
+
+impl<W: Stored> Product<'_, W> {
+    fn run(&self, vectors: Vectors, count: usize) {
+        if count == 0 {
+            return;
+        }
+        let panels = self.target.outputs.div_ceil(PANEL);
+        let blocks = count.div_ceil(TASK_ROWS);
+        let work = count * self.inputs * panels * PANEL;
+        let tasks_max = (work / TASK_WORK_MIN).clamp(1, 4 * rayon::current_num_threads());
+        let splits = tasks_max.div_ceil(blocks).min(panels);
+        let task = |index: usize| {
+            let (block, split) = (index / splits, index % splits);
+            let rows = even_part(count, blocks, block);
+            let panels = even_part(panels, splits, split);
+            tile::multiply(vectors, self, rows, panels);
+        };
+        if blocks * splits == 1 {
+            task(0);
+        } else {
+            (0..blocks * splits).into_par_iter().for_each(task);
+        }
+    }
+
+    /// Inputs per row.
+    pub fn inputs(&self) -> usize {
+        self.inputs
+    }
+
+    /// Weights of one panel: `inputs` chunks of sixteen.
+    #[inline(always)]
+    pub fn panel(&self, panel: usize) -> &[W] {
+        &self.panels[panel * PANEL * self.inputs..(panel + 1) * PANEL * self.inputs]
+    }
+
+    /// Some rows, one after another.
+    #[inline(always)]
+    pub fn rows(&self, rows: Range<usize>) -> &[f32] {
+        &self.rows[rows.start * self.inputs..rows.end * self.inputs]
+    }
+
+    /// Writes what a row and a panel came to.
+    #[inline(always)]
+    pub fn store(&self, row: usize, panel: usize, mut sums: [f32; PANEL]) {
+        let Output { start, outputs, bias, residual } = self.target;
+        let column = panel * PANEL;
+        let width = PANEL.min(outputs - column);
+        if let Some(bias) = bias {
+            for (sum, bias) in sums.iter_mut().zip(&bias[column..column + width]) {
+                *sum += bias;
+            }
+        }
+        let at = row * outputs + column;
+        if let Some(residual) = residual {
+            for (sum, residual) in sums.iter_mut().zip(&residual[at..at + width]) {
+                *sum += residual;
+            }
+        }
+        // SAFETY: `at + width` lies within the row, and this task alone owns the rectangle.
+        unsafe { std::ptr::copy_nonoverlapping(sums.as_ptr(), start.add(at), width) };
+    }
+}
+
+/// The `index`th of `parts` nearly equal parts of `0..length`.
+#[inline(always)]
+pub fn even_part(length: usize, parts: usize, index: usize) -> Range<usize> {
+    index * length / parts..(index + 1) * length / parts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbers(count: usize, seed: u64) -> Vec<f32> {
+        let mut state = seed;
+        (0..count)
+            .map(|_| {
+                state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+                (state >> 40) as f32 / (1 << 23) as f32 - 1.0
+            })
+            .collect()
+    }
+
+    #[test]
+    fn products_equal_plain_sums_at_every_shape() {
+        let shapes = [(1, 3, 5), (7, 64, 16), (8, 20, 47), (9, 5, 16), (10, 7, 64), (13, 33, 50)];
+        for (count, inputs, outputs) in shapes.into_iter().chain([(200, 48, 130)]) {
+            let (weight, rows) = (numbers(outputs * inputs, 1), numbers(count * inputs, 2));
+            let (bias, residual) = (numbers(outputs, 3), numbers(count * outputs, 4));
+            let short: Vec<f32> =
+                weight.iter().map(|&value| bf16::from_f32(value).to_f32()).collect();
+            let stored = [(weight, 4), (short, 2)];
+            for ((weight, bytes), vectors) in stored
+                .iter()
+                .flat_map(|one| Vectors::all().into_iter().map(move |kind| (one, kind)))
+            {
+                let packed = PackedWeight::pack(weight, outputs, inputs);
+                assert_eq!(packed.bytes(), outputs.div_ceil(PANEL) * PANEL * inputs * bytes);
+                let got = packed.multiply_with(vectors, &rows, Some(&bias), Some(&residual));
+                for row in 0..count {
+                    for output in 0..outputs {
+                        let mut sum = 0.0f32;
+                        for input in 0..inputs {
+                            sum = rows[row * inputs + input]
+                                .mul_add(weight[output * inputs + input], sum);
+                        }
+                        let at = row * outputs + output;
+                        assert_eq!(got[at], sum + bias[output] + residual[at], "{count} rows");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_row_does_not_depend_on_its_neighbours() {
+        let (inputs, outputs) = (300, 200);
+        let packed = PackedWeight::pack(&numbers(outputs * inputs, 5), outputs, inputs);
+        let rows = numbers(250 * inputs, 6);
+        let all = packed.multiply(&rows, None, None);
+        for row in [0, 5, 96, 249] {
+            let alone = packed.multiply(&rows[row * inputs..(row + 1) * inputs], None, None);
+            assert_eq!(alone, all[row * outputs..(row + 1) * outputs]);
+        }
+    }
+}

@@ -1,0 +1,230 @@
+//! The Llama decoder: embeddings in, hidden states after the final norm out.
+//!
+//! `prefill` runs the image and prompt of every session once and keeps their keys and values;
+//! `step` adds one token to every candidate. Rows of all sessions share each product with a weight.
+
+use std::ops::Range;
+
+use anyhow::{Result, ensure};
+use candle_core::{Device, Tensor};
+
+use crate::kernels::activation::gated_silu;
+use crate::network::attention::{Group, Prefix};
+use crate::kernels::backend::Backend;
+use crate::network::cache::{PrefixCache, TailCache};
+use crate::checkpoint::config::TextConfig;
+use crate::network::linear::Linear;
+use crate::kernels::norm::RmsNorm;
+use crate::network::rotary::{HeadShape, Rotary};
+use crate::network::trace::Trace;
+use crate::checkpoint::weights::Part;
+
+/// Token ids to hidden states to logits.
+pub struct Decoder {
+    embed_tokens: Tensor,
+    layers: Vec<Layer>,
+    norm: RmsNorm,
+    lm_head: Linear,
+    rotary: Rotary,
+    shape: HeadShape,
+    positions_max: usize,
+    backend: Backend,
+    device: Device,
+}
+
+/// One layer; queries, keys and values come of one product, gates and ups of another.
+struct Layer {
+    input_layernorm: RmsNorm,
+    query_key_value: Linear,
+    o_proj: Linear,
+    post_attention_layernorm: RmsNorm,
+    gate_up: Linear,
+    down_proj: Linear,
+    backend: Backend,
+}
+
+/// Positions whose hidden states are wanted of a prefill.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Wanted {
+    /// Each session's last; the last layer then skips all others, as nobody reads them.
+    Last,
+    All,
+}
+
+impl Decoder {
+    /// Takes the weights under `language_model`.
+    pub fn load(mut weights: Part<'_>, config: &TextConfig) -> Result<Decoder> {
+        let (hidden, vocabulary) = (config.hidden_size, config.vocab_size);
+        let (backend, device) = (weights.backend(), weights.device());
+        let mut layers = Vec::new();
+        for index in 0..config.num_hidden_layers {
+            layers.push(Layer::load(weights.part(&format!("model.layers.{index}")), config)?);
+        }
+        let norm = RmsNorm {
+            weight: weights.take("model.norm.weight", &[hidden])?,
+            epsilon: config.rms_norm_eps,
+            backend,
+        };
+        let lm_head = weights.take("lm_head.weight", &[vocabulary, hidden])?;
+        let shape = config.head_shape();
+        let positions_max = config.max_position_embeddings;
+        Ok(Decoder {
+            embed_tokens: weights.take("model.embed_tokens.weight", &[vocabulary, hidden])?,
+            layers,
+            norm,
+            lm_head: Linear::new(&lm_head, None, backend)?,
+            rotary: Rotary::new(shape.size, positions_max, config.rope_theta, backend, &device)?,
+            shape,
+            positions_max,
+            backend,
+            device,
+        })
+    }
+
+    /// Positions that a sequence may have.
+    pub fn positions_max(&self) -> usize {
+        self.positions_max
+    }
+
+    /// Bytes of the products' weights that a step reads; embeddings and norms are a few kilobytes.
+    pub fn step_bytes(&self) -> usize {
+        let layer = |layer: &Layer| {
+            let Layer { query_key_value, o_proj, gate_up, down_proj, .. } = layer;
+            [query_key_value, o_proj, gate_up, down_proj]
+                .into_iter()
+                .map(Linear::bytes)
+                .sum::<usize>()
+        };
+        self.layers.iter().map(layer).sum::<usize>() + self.lm_head.bytes()
+    }
+
+    /// Ids -> (ids, hidden)
+    pub fn embed(&self, ids: &[u32]) -> Result<Tensor> {
+        let ids = Tensor::new(ids, &self.device)?;
+        Ok(self.embed_tokens.index_select(&ids, 0)?)
+    }
+
+    /// Runs whole sequences whose embeddings stand one after another in `rows`.
+    pub fn prefill(
+        &self,
+        rows: &Tensor,
+        sessions: &[Range<usize>],
+        wanted: Wanted,
+        trace: &mut Trace,
+    ) -> Result<(PrefixCache, Tensor)> {
+        let longest = sessions.iter().map(Range::len).max().unwrap_or(0);
+        ensure!(
+            longest <= self.positions_max,
+            "prompt: expected at most {} positions, got {longest}",
+            self.positions_max
+        );
+        let positions: Vec<usize> = sessions.iter().flat_map(|rows| 0..rows.len()).collect();
+        let mut rows = rows.clone();
+        let mut prefixes = Vec::new();
+        for (index, layer) in self.layers.iter().enumerate() {
+            let (mut query, key, value) =
+                self.rotary.split(&layer.joined(&rows)?, self.shape, &positions)?;
+            let prefix = Prefix::new(&key, &value, sessions, self.shape, self.backend)?;
+            let mut groups = groups_of(sessions);
+            if wanted == Wanted::Last && index + 1 == self.layers.len() {
+                let last: Vec<u32> = sessions.iter().map(|rows| rows.end as u32 - 1).collect();
+                let last = Tensor::new(last, &self.device)?;
+                (rows, query) = (rows.index_select(&last, 0)?, query.index_select(&last, 0)?);
+                let one = |session| Group { session, rows: session..session + 1 };
+                groups = (0..sessions.len()).map(one).collect();
+            }
+            let mixed = prefix.attend(&query, &groups, true)?;
+            rows = layer.finish(&rows, &mixed)?;
+            trace.record(|| format!("language_model.model.layers.{index}"), &rows);
+            prefixes.push(prefix);
+        }
+        let hidden = self.norm.forward(&rows)?;
+        trace.record(|| "language_model.model.norm".to_string(), &hidden);
+        Ok((PrefixCache::new(prefixes, sessions), hidden))
+    }
+
+    /// Empty tails for rows that continue the sessions listed, in rising order.
+    pub fn tails(&self, sessions: Vec<usize>, capacity: usize) -> TailCache {
+        TailCache::new(sessions, capacity, self.layers.len(), self.shape, self.backend)
+    }
+
+    /// Adds one token to every row of `tail`; (rows, hidden) after the final norm.
+    pub fn step(&self, ids: &[u32], prefix: &PrefixCache, tail: &mut TailCache) -> Result<Tensor> {
+        let positions = tail.positions(prefix);
+        ensure!(
+            positions.iter().all(|&position| position < self.positions_max),
+            "candidate: expected at most {} positions, got one more",
+            self.positions_max
+        );
+        let groups = tail.groups();
+        let mut rows = self.embed(ids)?;
+        for (index, layer) in self.layers.iter().enumerate() {
+            let (query, key, value) =
+                self.rotary.split(&layer.joined(&rows)?, self.shape, &positions)?;
+            let own = &mut tail.layers[index];
+            own.push(&key, &value)?;
+            let mixed = own.attend(&query, &prefix.layers[index], &groups)?;
+            rows = layer.finish(&rows, &mixed)?;
+        }
+        tail.advance();
+        Ok(self.norm.forward(&rows)?)
+    }
+
+    /// (rows, hidden) after the final norm -> (rows, vocabulary with padding)
+    pub fn logits(&self, hidden: &Tensor) -> Result<Tensor> {
+        Ok(self.lm_head.forward(hidden)?)
+    }
+}
+
+fn groups_of(sessions: &[Range<usize>]) -> Vec<Group> {
+    let sessions = sessions.iter().cloned().enumerate();
+    sessions.map(|(session, rows)| Group { session, rows }).collect()
+}
+
+impl Layer {
+    fn load(mut weights: Part<'_>, config: &TextConfig) -> Result<Layer> {
+        let (hidden, width) = (config.hidden_size, config.intermediate_size);
+        let shape = config.head_shape();
+        let (query_width, key_width) = (shape.query_width(), shape.key_width());
+        let backend = weights.backend();
+        let mut norm = |name: &str| -> Result<RmsNorm> {
+            let weight = weights.take(&format!("{name}.weight"), &[hidden])?;
+            Ok(RmsNorm { weight, epsilon: config.rms_norm_eps, backend })
+        };
+        let input_layernorm = norm("input_layernorm")?;
+        let post_attention_layernorm = norm("post_attention_layernorm")?;
+        let mut weight = |name: &str, outputs: usize, inputs: usize| {
+            weights.take(&format!("{name}.weight"), &[outputs, inputs])
+        };
+        let query_key_value = [
+            weight("self_attn.q_proj", query_width, hidden)?,
+            weight("self_attn.k_proj", key_width, hidden)?,
+            weight("self_attn.v_proj", key_width, hidden)?,
+        ];
+        let gate_up =
+            [weight("mlp.gate_proj", width, hidden)?, weight("mlp.up_proj", width, hidden)?];
+        let o_proj = weight("self_attn.o_proj", hidden, query_width)?;
+        let down_proj = weight("mlp.down_proj", hidden, width)?;
+        Ok(Layer {
+            input_layernorm,
+            query_key_value: Linear::new(&Tensor::cat(&query_key_value, 0)?, None, backend)?,
+            o_proj: Linear::new(&o_proj, None, backend)?,
+            post_attention_layernorm,
+            gate_up: Linear::new(&Tensor::cat(&gate_up, 0)?, None, backend)?,
+            down_proj: Linear::new(&down_proj, None, backend)?,
+            backend,
+        })
+    }
+
+    /// (rows, hidden) -> (rows, queries and keys and values)
+    fn joined(&self, rows: &Tensor) -> candle_core::Result<Tensor> {
+        self.query_key_value.forward(&self.input_layernorm.forward(rows)?)
+    }
+
+    /// All that comes after attention.
+    fn finish(&self, rows: &Tensor, mixed: &Tensor) -> candle_core::Result<Tensor> {
+        let rows = self.o_proj.forward_onto(rows, mixed)?;
+        let gates = self.gate_up.forward(&self.post_attention_layernorm.forward(&rows)?)?;
+        self.down_proj.forward_onto(&rows, &gated_silu(&gates, self.backend)?)
+    }
+}

@@ -1,0 +1,94 @@
+//! The whole network: image and prompt ids in, hidden states and logits out.
+
+use std::ops::Range;
+use std::path::Path;
+
+use anyhow::Result;
+use candle_core::{Device, Tensor};
+use protocol::message::Image;
+use rayon::prelude::*;
+
+use crate::kernels::backend::Backend;
+use crate::network::cache::PrefixCache;
+use crate::checkpoint::config::Config;
+use crate::network::decoder::{Decoder, Wanted};
+use crate::network::projector::Projector;
+use crate::network::trace::Trace;
+use crate::network::vision::VisionBackbone;
+use crate::checkpoint::weights::{Weights, weight_files};
+
+/// Sessions per task of a prefill: few enough that a layer's rows stay in the caches.
+const TASK_SESSIONS: usize = 2;
+
+/// Vision towers, projector and decoder of one checkpoint.
+pub struct Network {
+    vision_backbone: VisionBackbone,
+    projector: Projector,
+    pub decoder: Decoder,
+    /// Weights in the file that no output depends on.
+    pub dead_weights: usize,
+}
+
+/// What a session asks the network to continue: the first id, the image, the other ids.
+#[derive(Clone, Copy)]
+pub struct Context<'a> {
+    pub image: &'a Image,
+    pub ids: &'a [u32],
+}
+
+impl Network {
+    /// Loads the weights of a checkpoint's folder.
+    pub fn load(
+        directory: &Path,
+        config: &Config,
+        device: &Device,
+        backend: Backend,
+    ) -> Result<Network> {
+        let mut weights = Weights::load(&weight_files(directory)?, device, backend)?;
+        let width = config.towers.iter().map(|tower| tower.embed_dim).sum();
+        let (hidden, fused) = (config.text.hidden_size, config.towers.len() == 2);
+        let vision_backbone =
+            VisionBackbone::load(weights.part("vision_backbone"), &config.towers)?;
+        let projector = Projector::load(weights.part("projector"), width, hidden, fused)?;
+        let decoder = Decoder::load(weights.part("language_model"), &config.text)?;
+        let towers = VisionBackbone::blocks_used(&config.towers);
+        let towers: Vec<(&str, usize)> =
+            towers.iter().map(|(name, blocks)| (name.as_str(), *blocks)).collect();
+        let dead_weights = weights.finish(&towers)?;
+        Ok(Network { vision_backbone, projector, decoder, dead_weights })
+    }
+
+    /// Runs images and prompts of all sessions; last hidden states after the final norm.
+    pub fn prefill_all(&self, contexts: &[Context<'_>]) -> Result<(PrefixCache, Tensor)> {
+        let part = |contexts| self.prefill(contexts, Wanted::Last, &mut Trace::off());
+        let parts = contexts.par_chunks(TASK_SESSIONS).map(part).collect::<Result<Vec<_>>>()?;
+        let (caches, hidden): (Vec<PrefixCache>, Vec<Tensor>) = parts.into_iter().unzip();
+        Ok((PrefixCache::join(caches), Tensor::cat(&hidden, 0)?))
+    }
+
+    /// Runs images and prompts together; hidden states after the final norm of the positions wanted.
+    pub fn prefill(
+        &self,
+        contexts: &[Context<'_>],
+        wanted: Wanted,
+        trace: &mut Trace,
+    ) -> Result<(PrefixCache, Tensor)> {
+        let images: Vec<&Image> = contexts.iter().map(|context| context.image).collect();
+        let features = self.vision_backbone.forward(&images, trace)?;
+        let patches = self.projector.forward(&features, trace)?;
+        let count = patches.dim(0)? / contexts.len();
+        let mut parts = Vec::with_capacity(3 * contexts.len());
+        let mut sessions: Vec<Range<usize>> = Vec::with_capacity(contexts.len());
+        for (index, context) in contexts.iter().enumerate() {
+            let (first, others) = context.ids.split_at(1);
+            parts.push(self.decoder.embed(first)?);
+            parts.push(patches.narrow(0, index * count, count)?);
+            parts.push(self.decoder.embed(others)?);
+            let start = sessions.last().map_or(0, |rows| rows.end);
+            sessions.push(start..start + context.ids.len() + count);
+        }
+        let rows = Tensor::cat(&parts, 0)?;
+        trace.record(|| "embeddings".to_string(), &rows);
+        self.decoder.prefill(&rows, &sessions, wanted, trace)
+    }
+}

@@ -1,0 +1,208 @@
+//! The vision backbone: one timm-style vision transformer, or two whose features are joined.
+//!
+//! Features are the output of the second-to-last block, without final norm and prefix tokens.
+//! Rows of all images stand one after another: (images x tokens, width).
+
+use std::ops::Range;
+
+use anyhow::Result;
+use candle_core::{Device, Tensor};
+
+use crate::kernels::activation::gelu;
+use crate::network::attention::{Group, Prefix};
+use crate::kernels::backend::Backend;
+use crate::checkpoint::config::TowerConfig;
+use crate::network::linear::Linear;
+use crate::kernels::norm::LayerNorm;
+use crate::network::pixels::{DINO, Normalisation, SIGLIP, patch_rows};
+use crate::network::rotary::HeadShape;
+use crate::network::trace::Trace;
+use crate::checkpoint::weights::Part;
+use protocol::message::Image;
+
+/// timm's value for both towers of OpenVLA; PyTorch's own default would be 1e-5.
+const LAYER_NORM_EPSILON: f64 = 1e-6;
+const TOWER_NAMES: [&str; 2] = ["featurizer", "fused_featurizer"];
+
+/// All towers of a checkpoint.
+pub struct VisionBackbone {
+    towers: Vec<Tower>,
+}
+
+struct Tower {
+    config: TowerConfig,
+    name: &'static str,
+    normalisation: Normalisation,
+    patch_embed: Linear,
+    /// (patches, width)
+    pos_embed: Tensor,
+    /// (prefix tokens, width), when there are any.
+    prefix: Option<Tensor>,
+    blocks: Vec<Block>,
+    device: Device,
+}
+
+struct Block {
+    norm1: LayerNorm,
+    query: Linear,
+    key: Linear,
+    value: Linear,
+    proj: Linear,
+    ls1: Option<Tensor>,
+    norm2: LayerNorm,
+    fc1: Linear,
+    fc2: Linear,
+    ls2: Option<Tensor>,
+    shape: HeadShape,
+    backend: Backend,
+}
+
+impl VisionBackbone {
+    /// Takes the towers' weights; the first tower is DINO-like when there are two.
+    pub fn load(mut weights: Part<'_>, configs: &[TowerConfig]) -> Result<VisionBackbone> {
+        let mut towers = Vec::new();
+        for (index, config) in configs.iter().enumerate() {
+            let fused_first = configs.len() == 2 && index == 0;
+            let normalisation = if fused_first { DINO } else { SIGLIP };
+            let name = TOWER_NAMES[index];
+            towers.push(Tower::load(weights.part(name), config, name, normalisation)?);
+        }
+        Ok(VisionBackbone { towers })
+    }
+
+    /// Names of the towers with the number of blocks that are run.
+    pub fn blocks_used(configs: &[TowerConfig]) -> Vec<(String, usize)> {
+        let named = configs.iter().zip(TOWER_NAMES);
+        named.map(|(config, name)| (format!("vision_backbone.{name}"), config.depth - 1)).collect()
+    }
+
+    /// Images of the model's size -> (images x patches, width of all towers).
+    pub fn forward(&self, images: &[&Image], trace: &mut Trace) -> Result<Tensor> {
+        let features = self.towers.iter().map(|tower| tower.forward(images, trace));
+        let features = features.collect::<Result<Vec<_>>>()?;
+        match features.as_slice() {
+            [only] => Ok(only.clone()),
+            several => Ok(Tensor::cat(several, 1)?),
+        }
+    }
+}
+
+impl Tower {
+    fn load(
+        mut weights: Part<'_>,
+        config: &TowerConfig,
+        name: &'static str,
+        normalisation: Normalisation,
+    ) -> Result<Tower> {
+        let (width, patch) = (config.embed_dim, config.patch_size);
+        let patches = config.side() * config.side();
+        let device = weights.device();
+        let backend = weights.backend();
+        let kernel = weights.take("patch_embed.proj.weight", &[width, 3, patch, patch])?;
+        let bias = weights.take("patch_embed.proj.bias", &[width])?;
+        let patch_embed = Linear::new(&kernel.flatten_from(1)?, Some(bias), backend)?;
+        let pos_embed = weights.take("pos_embed", &[1, patches, width])?.squeeze(0)?;
+        let mut prefix = Vec::new();
+        if config.class_token {
+            prefix.push(weights.take("cls_token", &[1, 1, width])?.squeeze(0)?);
+        }
+        if config.registers > 0 {
+            prefix.push(weights.take("reg_token", &[1, config.registers, width])?.squeeze(0)?);
+        }
+        let prefix = if prefix.is_empty() { None } else { Some(Tensor::cat(&prefix, 0)?) };
+        let mut blocks = Vec::new();
+        for index in 0..config.depth - 1 {
+            blocks.push(Block::load(weights.part(&format!("blocks.{index}")), config)?);
+        }
+        let config = config.clone();
+        Ok(Tower { config, name, normalisation, patch_embed, pos_embed, prefix, blocks, device })
+    }
+
+    fn forward(&self, images: &[&Image], trace: &mut Trace) -> Result<Tensor> {
+        let (side, patch) = (self.config.side(), self.config.patch_size);
+        let (patches, width) = (side * side, self.config.embed_dim);
+        let inputs = patch_rows(images, side, patch, &self.normalisation);
+        let shape = (images.len() * patches, 3 * patch * patch);
+        let rows = self.patch_embed.forward(&Tensor::from_vec(inputs, shape, &self.device)?)?;
+        trace.record(|| format!("vision_backbone.{}.patch_embed", self.name), &rows);
+        // (images x patches, width) -> (images, patches, width)
+        let rows = rows.reshape((images.len(), patches, width))?.broadcast_add(&self.pos_embed)?;
+        let rows = match &self.prefix {
+            Some(prefix) => {
+                let shape = (images.len(), prefix.dim(0)?, width);
+                Tensor::cat(&[prefix.unsqueeze(0)?.expand(shape)?, rows], 1)?
+            }
+            None => rows,
+        };
+        let tokens = rows.dim(1)?;
+        // (images, tokens, width) -> (images x tokens, width)
+        let mut rows = rows.contiguous()?.flatten_to(1)?;
+        for (index, block) in self.blocks.iter().enumerate() {
+            rows = block.forward(&rows, tokens)?;
+            trace.record(|| format!("vision_backbone.{}.blocks.{index}", self.name), &rows);
+        }
+        // (images x tokens, width) -> (images, patches, width) -> (images x patches, width)
+        let rows = rows.reshape((images.len(), tokens, width))?;
+        let rows = rows.narrow(1, self.config.prefix_tokens(), patches)?;
+        let rows = rows.contiguous()?.flatten_to(1)?;
+        trace.record(|| format!("vision_backbone.{}", self.name), &rows);
+        Ok(rows)
+    }
+}
+
+impl Block {
+    fn load(mut weights: Part<'_>, config: &TowerConfig) -> Result<Block> {
+        let (width, hidden) = (config.embed_dim, config.mlp_width());
+        let backend = weights.backend();
+        let mut norm = |name: &str| -> Result<LayerNorm> {
+            let weight = weights.take(&format!("{name}.weight"), &[width])?;
+            let bias = weights.take(&format!("{name}.bias"), &[width])?;
+            Ok(LayerNorm { weight, bias, epsilon: LAYER_NORM_EPSILON, backend })
+        };
+        let (norm1, norm2) = (norm("norm1")?, norm("norm2")?);
+        let joined = weights.take("attn.qkv.weight", &[3 * width, width])?;
+        let joined_bias = weights.take("attn.qkv.bias", &[3 * width])?;
+        let third = |index: usize| {
+            let bias = joined_bias.narrow(0, index * width, width)?.contiguous()?;
+            Linear::new(&joined.narrow(0, index * width, width)?, Some(bias), backend)
+        };
+        let mut linear = |name: &str, outputs: usize, inputs: usize| -> Result<Linear> {
+            let weight = weights.take(&format!("{name}.weight"), &[outputs, inputs])?;
+            let bias = weights.take(&format!("{name}.bias"), &[outputs])?;
+            Ok(Linear::new(&weight, Some(bias), backend)?)
+        };
+        let proj = linear("attn.proj", width, width)?;
+        let (fc1, fc2) = (linear("mlp.fc1", hidden, width)?, linear("mlp.fc2", width, hidden)?);
+        let mut layer_scale = |name: &str| -> Result<Option<Tensor>> {
+            let name = format!("{name}.scale_factor");
+            config.layer_scale.then(|| weights.take(&name, &[width])).transpose()
+        };
+        let (ls1, ls2) = (layer_scale("ls1")?, layer_scale("ls2")?);
+        let (query, key, value) = (third(0)?, third(1)?, third(2)?);
+        let shape = config.head_shape();
+        Ok(Block { norm1, query, key, value, proj, ls1, norm2, fc1, fc2, ls2, shape, backend })
+    }
+
+    /// (images x tokens, width) -> the same; tokens of one image see each other and nothing else.
+    fn forward(&self, rows: &Tensor, tokens: usize) -> Result<Tensor> {
+        let images: Vec<Range<usize>> =
+            (0..rows.dim(0)? / tokens).map(|image| image * tokens..(image + 1) * tokens).collect();
+        let input = self.norm1.forward(rows)?;
+        let (key, value) = (self.key.forward(&input)?, self.value.forward(&input)?);
+        let keys = Prefix::new(&key, &value, &images, self.shape, self.backend)?;
+        let groups: Vec<Group> =
+            images.into_iter().enumerate().map(|(session, rows)| Group { session, rows }).collect();
+        let mixed = keys.attend(&self.query.forward(&input)?, &groups, false)?;
+        let rows = onto(rows, &self.proj, &mixed, self.ls1.as_ref())?;
+        let hidden = self.fc1.forward(&self.norm2.forward(&rows)?)?;
+        onto(&rows, &self.fc2, &gelu(&hidden, self.backend)?, self.ls2.as_ref())
+    }
+}
+
+/// rows + layer scale x linear(input).
+fn onto(rows: &Tensor, linear: &Linear, input: &Tensor, scale: Option<&Tensor>) -> Result<Tensor> {
+    Ok(match scale {
+        Some(scale) => (rows + linear.forward(input)?.broadcast_mul(scale)?)?,
+        None => linear.forward_onto(rows, input)?,
+    })
+}

@@ -1,0 +1,177 @@
+//! The checkpoint as a policy.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result, ensure};
+use async_trait::async_trait;
+use candle_core::{Device, Tensor};
+use decision::{Candidate, Image, Policy, PolicyInfo, Proposal, ProposalRequest};
+
+use crate::checkpoint::completion::CompletionParser;
+use crate::generate::decode_loop::{Continuation, Limits};
+use crate::generate::timings::{self, Timings};
+use crate::generate::worker_pools::WorkerPools;
+use crate::kernels::backend::Backend;
+use crate::kernels::device::DeviceName;
+use crate::network::decoder::Wanted;
+use crate::network::forward::{Context, Network};
+use crate::network::trace::Trace;
+
+/// A loaded checkpoint.
+pub struct Vla {
+    parser: CompletionParser,
+    pub(crate) network: Network,
+    pools: WorkerPools,
+    info: PolicyInfo,
+}
+
+impl Vla {
+    /// Loads a checkpoint's folder onto a device: config.json, model.safetensors (or shards), tokenizer.json.
+    pub fn load(directory: &Path, device: DeviceName) -> Result<Vla> {
+        let device = device.open()?;
+        Vla::load_on(directory, &device, Backend::for_device(&device))
+    }
+
+    /// Loads it onto an open device, computing as told.
+    pub fn load_on(directory: &Path, device: &Device, backend: Backend) -> Result<Vla> {
+        let load = || -> Result<Vla> {
+            let parser = CompletionParser::load(directory)?;
+            let network = Network::load(directory, &parser.config, device, backend)?;
+            tracing::debug!(
+                dead_weights = network.dead_weights,
+                digest = parser.digest(),
+                "policy loaded"
+            );
+            let info = PolicyInfo {
+                digest: parser.digest().to_owned(),
+                image_size: (parser.config.image_size, parser.config.image_size),
+                action_space: parser.action_space(),
+                hidden_size: Some(parser.hidden_size()),
+            };
+            Ok(Vla { parser, network, pools: WorkerPools::new(backend)?, info })
+        };
+        load().with_context(|| format!("cannot load the policy in {}", directory.display()))
+    }
+
+    /// Reads completions of this checkpoint.
+    pub fn parser(&self) -> &CompletionParser {
+        &self.parser
+    }
+
+    /// Samples the candidates of every request; all requests share the network's products. Blocks while it computes.
+    pub fn propose_now(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
+        if requests.is_empty() {
+            return Ok(Vec::new());
+        }
+        let prompts = requests.iter().map(|request| self.check(request));
+        let prompts: Vec<Vec<u32>> = prompts.collect::<Result<_>>()?;
+        let sessions: Vec<Continuation<'_>> = requests
+            .iter()
+            .zip(&prompts)
+            .map(|(request, ids)| Continuation {
+                context: Context { image: request.image, ids },
+                candidates: request.candidates,
+                temperature: request.temperature,
+                seed: request.seed,
+                tokens_max: self.tokens_max(ids.len()),
+            })
+            .collect();
+        let limits = Limits {
+            bins: &self.parser.bins,
+            vocabulary: self.parser.config.vocabulary,
+            end: self.parser.config.text.eos_token_id,
+        };
+        let completions = self.pools.complete(&self.network, &sessions, &limits)?;
+        let mut proposals: Vec<Proposal> =
+            requests.iter().map(|_| Proposal { candidates: Vec::new() }).collect();
+        for completion in completions {
+            proposals[completion.session].candidates.push(Candidate {
+                parsed: self.parser.parse(&completion.tokens),
+                confidence: self
+                    .parser
+                    .confidence(&completion.tokens, &completion.log_probabilities),
+                log_probability: completion.log_probability as f32,
+                log_probabilities: completion.log_probabilities,
+                tokens: completion.tokens,
+                hidden: completion.hidden,
+            });
+        }
+        Ok(proposals)
+    }
+
+    /// Outputs of every layer by the checkpoint's names, then `logits` of all positions.
+    pub fn activations(&self, image: &Image, ids: &[u32]) -> Result<Vec<(String, Tensor)>> {
+        self.check_image(image)?;
+        let mut trace = Trace::on();
+        let contexts = [Context { image, ids }];
+        let (_, hidden) = self.network.prefill(&contexts, Wanted::All, &mut trace)?;
+        trace.record(|| "logits".to_string(), &self.network.decoder.logits(&hidden)?);
+        Ok(trace.into_outputs()?)
+    }
+
+    /// Times prefill and steps of these requests, for so many tokens of every candidate.
+    pub fn time(&self, requests: &[ProposalRequest<'_>], tokens: usize) -> Result<Timings> {
+        let prompts = requests.iter().map(|request| self.check(request));
+        let prompts: Vec<Vec<u32>> = prompts.collect::<Result<_>>()?;
+        let contexts: Vec<Context<'_>> = requests
+            .iter()
+            .zip(&prompts)
+            .map(|(request, ids)| Context { image: request.image, ids })
+            .collect();
+        let candidates = requests.first().map_or(1, |request| request.candidates);
+        timings::measure(&self.network, &contexts, candidates, tokens)
+    }
+
+    /// Bytes of weights that one token step reads, whatever the number of rows.
+    pub fn step_bytes(&self) -> usize {
+        self.network.decoder.step_bytes()
+    }
+
+    /// Tokens that may follow a prompt of so many ids and the image.
+    fn tokens_max(&self, prompt_ids: usize) -> usize {
+        let side = self.parser.config.towers[0].side();
+        let room = self.network.decoder.positions_max().saturating_sub(prompt_ids + side * side);
+        self.parser.config.completion_tokens_max.min(room)
+    }
+
+    /// The prompt of a request that can be answered.
+    fn check(&self, request: &ProposalRequest<'_>) -> Result<Vec<u32>> {
+        self.check_image(request.image)?;
+        ensure!(request.candidates > 0, "candidates: expected at least 1, got 0");
+        ensure!(
+            request.temperature.is_finite() && request.temperature >= 0.0,
+            "temperature: expected 0 or more, got {}",
+            request.temperature
+        );
+        self.parser.prompter.ids(request.instruction)
+    }
+
+    fn check_image(&self, image: &Image) -> Result<()> {
+        let (height, width) = self.info.image_size;
+        ensure!(
+            (image.height, image.width) == (height, width),
+            "image: expected {height} x {width} pixels, got {} x {}; ask the server for that size",
+            image.height,
+            image.width
+        );
+        let length = height * width * 3;
+        ensure!(
+            image.pixels.len() == length,
+            "image: expected {length} bytes, got {}",
+            image.pixels.len()
+        );
+        Ok(())
+    }
+}
+
+#[async_trait]
+impl Policy for Vla {
+    fn info(&self) -> &PolicyInfo {
+        &self.info
+    }
+
+    /// Computes in the calling thread and on all cores.
+    async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
+        self.propose_now(requests)
+    }
+}

@@ -1,0 +1,160 @@
+//! Loading: every weight is used or known to be dead, and unknown layouts are refused in words.
+
+use std::collections::HashMap;
+
+use anyhow::Result;
+
+use crate::checkpoint::config::Config;
+use super::*;
+
+/// Copies a tiny checkpoint into a fresh folder, after a change of its weights and its config.
+fn load_changed(
+    name: &str,
+    weights: impl FnOnce(&mut HashMap<String, Tensor>) -> Result<()>,
+    config: impl FnOnce(&mut serde_json::Value),
+) -> Result<Policy> {
+    let (source, directory) = (fixtures().join(name), tempfile::tempdir()?);
+    let mut tensors =
+        candle_core::safetensors::load(source.join("model.safetensors"), &Device::Cpu)?;
+    weights(&mut tensors)?;
+    candle_core::safetensors::save(&tensors, directory.path().join("model.safetensors"))?;
+    let text = std::fs::read_to_string(source.join("config.json"))?;
+    let mut value: serde_json::Value = serde_json::from_str(&text)?;
+    config(&mut value);
+    std::fs::write(directory.path().join("config.json"), value.to_string())?;
+    std::fs::copy(source.join("tokenizer.json"), directory.path().join("tokenizer.json"))?;
+    Vla::load(directory.path(), DeviceName::Cpu)
+}
+
+fn refusal(policy: Result<Policy>) -> String {
+    match policy {
+        // The outermost context names a temporary folder.
+        Err(error) => error.chain().skip(1).map(ToString::to_string).collect::<Vec<_>>().join(": "),
+        Ok(_) => "accepted".to_string(),
+    }
+}
+
+#[test]
+fn dead_weights_are_counted() -> Result<()> {
+    assert_eq!(tiny("tiny", Backend::Kernels)?.network.dead_weights, 0);
+    // Per tower: a block of 12 weights (14 with layer scale) that is never run, and the final norm.
+    assert_eq!(tiny("tiny-fused", Backend::Kernels)?.network.dead_weights, 14 + 12 + 2 * 2);
+    Ok(())
+}
+
+#[test]
+fn sixteen_bit_weights_load() -> Result<()> {
+    let halve = |tensors: &mut HashMap<String, Tensor>| -> Result<()> {
+        for tensor in tensors.values_mut() {
+            *tensor = tensor.to_dtype(DType::BF16)?;
+        }
+        Ok(())
+    };
+    let policy = load_changed("tiny", halve, |_| {})?;
+    assert_ne!(policy.digest(), tiny("tiny", Backend::Kernels)?.digest());
+    Ok(())
+}
+
+#[test]
+fn weights_that_do_not_fit_are_refused() -> Result<()> {
+    let check = |change: fn(&mut HashMap<String, Tensor>) -> Result<()>, expected: &str| {
+        assert_eq!(refusal(load_changed("tiny", change, |_| {})), expected);
+    };
+    check(
+        |tensors| {
+            tensors.remove("projector.fc2.bias");
+            Ok(())
+        },
+        "weights: projector.fc2.bias is missing, expected shape [32]",
+    );
+    check(
+        |tensors| {
+            let extra = tensors["projector.fc2.bias"].clone();
+            tensors.insert("projector.fc3.bias".to_string(), extra);
+            Ok(())
+        },
+        "weights: 1 unexpected, the first is projector.fc3.bias",
+    );
+    check(
+        |tensors| {
+            let narrow = tensors["projector.fc2.bias"].narrow(0, 0, 31)?;
+            tensors.insert("projector.fc2.bias".to_string(), narrow.contiguous()?);
+            Ok(())
+        },
+        "projector.fc2.bias: expected [32], got [31]",
+    );
+    Ok(())
+}
+
+#[test]
+fn unknown_layouts_are_refused_in_words() {
+    fn check(change: impl FnOnce(&mut serde_json::Value), expected: &str) {
+        let got = refusal(load_changed("tiny", |_| Ok(()), change));
+        assert!(got.contains(expected), "expected {expected:?}, got {got:?}");
+    }
+    check(|c| c["model_type"] = "llava".into(), "model_type: expected openvla, got llava");
+    check(
+        |c| c["timm_model_ids"] = vec!["vit_huge"].into(),
+        "accepted", // vision_config describes it
+    );
+    check(
+        |c| c["vision_config"] = serde_json::Value::Null,
+        "timm_model_ids: rever_vit is unknown and has no vision_config",
+    );
+    check(
+        |c| c["vision_config"]["window"] = 7.into(),
+        "unknown field `window`, expected one of `image_size`, `patch_size`, `embed_dim`, \
+         `depth`, `num_heads`, `mlp_ratio`, `class_token`, `registers`, `layer_scale`",
+    );
+    check(
+        |c| c["image_resize_strategy"] = "stretch".into(),
+        "image_resize_strategy: expected resize-naive or letterbox, got stretch",
+    );
+    check(
+        |c| c["text_config"]["hidden_act"] = "gelu".into(),
+        "hidden_act: expected silu, got gelu",
+    );
+    check(
+        |c| c["text_config"]["rope_scaling"] = "dynamic".into(),
+        "rope_scaling: expected none, got \"dynamic\"",
+    );
+    check(
+        |c| c["unnorm_key"] = "bridge_orig".into(),
+        "unnorm_key: expected one of [\"rever_bridge\"], got bridge_orig",
+    );
+    check(
+        |c| c["prompt_template"] = serde_json::Value::Null,
+        "prompt_template: expected one, as llm_backbone_id \"rever-llama\" implies none",
+    );
+    check(
+        |c| c["pad_to_multiple_of"] = 128.into(),
+        "tokenizer.json: expected 896 tokens (and at most one for padding), got 960",
+    );
+}
+
+#[test]
+fn openvla_7b_is_a_known_layout() -> Result<()> {
+    // The fields of openvla-7b's config.json that decide its layout; text_config says only what
+    // differs from Hugging Face's defaults.
+    let text = r#"{"model_type": "openvla", "llm_backbone_id": "llama2-7b-pure",
+        "timm_model_ids": ["vit_large_patch14_reg4_dinov2.lvd142m", "vit_so400m_patch14_siglip_224"],
+        "timm_override_act_layers": [null, null], "use_fused_vision_backbone": true,
+        "image_sizes": [224, 224], "image_resize_strategy": "resize-naive",
+        "text_config": {"model_type": "llama", "vocab_size": 32064, "pad_token_id": 32000},
+        "pad_to_multiple_of": 64, "n_action_bins": 256,
+        "norm_stats": {"bridge_orig": {"action": {"q01": [-1,-1,-1,-1,-1,-1,0],
+            "q99": [1,1,1,1,1,1,1], "mask": [true,true,true,true,true,true,false]}}}}"#;
+    let directory = tempfile::tempdir()?;
+    let path = directory.path().join("config.json");
+    std::fs::write(&path, text)?;
+    let config = Config::load(&path)?;
+    assert_eq!(config.vocabulary, 32000);
+    assert_eq!(config.towers.iter().map(|tower| tower.embed_dim).sum::<usize>(), 2176);
+    assert_eq!(config.towers.iter().map(|tower| tower.depth - 2).collect::<Vec<_>>(), [22, 25]);
+    assert_eq!(config.towers[1].mlp_width(), 4304);
+    assert_eq!(config.towers[1].head_shape().size, 72);
+    assert_eq!((config.text.num_hidden_layers, config.text.rms_norm_eps), (32, 1e-6));
+    assert!(config.prompt_template.starts_with("In: What action"));
+    assert!(!config.reasoning && config.completion_tokens_max == 8);
+    Ok(())
+}
