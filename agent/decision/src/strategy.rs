@@ -92,6 +92,12 @@ impl Strategy {
         }
     }
 
+    /// Whether the choice among the well-formed candidates depends on what they are: the scores of such choices run high
+    /// or low by selection.
+    pub fn compares_candidates(self) -> bool {
+        !matches!(self, Strategy::Greedy | Strategy::Sample | Strategy::FirstWellFormed)
+    }
+
     /// Whether [`Alternatives::logits`] must be there.
     pub fn needs_verifier(self) -> bool {
         matches!(self, Strategy::Verifier | Strategy::Worst | Strategy::VerifierMedoid)

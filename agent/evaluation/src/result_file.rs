@@ -107,9 +107,9 @@ impl ResultFile {
         let mut rows = Vec::new();
         for result in &results.settings {
             for (task, rates) in results.tasks.iter().zip(&result.tasks) {
-                rows.push(row(task, &result.setting, rates));
+                rows.push(row(&task.task, &task.variant, &result.setting, rates));
             }
-            rows.push(row(AVERAGE, &result.setting, &result.all));
+            rows.push(row(AVERAGE, VARIANT_DEFAULT, &result.setting, &result.all));
         }
         let paired = results.gains.iter().map(|gain| Paired {
             a: gain.better.strategy.to_string(),
@@ -146,12 +146,12 @@ impl ResultFile {
     }
 }
 
-fn row(task: &str, setting: &Setting, rates: &Rates) -> Row {
+fn row(task: &str, variant: &str, setting: &Setting, rates: &Rates) -> Row {
     let value = |rate: Rate| rate.value();
     let (grasp, interval) = (rates.grasped.interval(), rates.success.interval());
     Row {
         task: task.to_owned(),
-        variant: VARIANT_DEFAULT.to_owned(),
+        variant: variant.to_owned(),
         strategy: setting.strategy.to_string(),
         candidates: setting.candidates,
         temperature: setting.temperature,

@@ -3,12 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::Result;
+use serde_json::Value;
 
-use store::run::{EpisodeSummary, FaultRecord};
 use crate::statistics::{Gain, RESAMPLES, Rate, headroom_fraction, paired_bootstrap, quantile};
-use decision::Strategy;
-use decision::Setting;
-use crate::suite::TASKS;
+use decision::{Setting, Strategy, TaskId};
+use store::run::{EpisodeSummary, FaultRecord};
 
 /// Bootstraps are seeded, so that the same records always give the same tables.
 const BOOTSTRAP_SEED: u64 = 0;
@@ -16,8 +15,8 @@ const BOOTSTRAP_SEED: u64 = 0;
 /// Everything that tables and figures show.
 #[derive(Debug, Clone)]
 pub struct Results {
-    /// Task names in the order of every table.
-    pub tasks: Vec<String>,
+    /// Tasks in the order of every table.
+    pub tasks: Vec<TaskId>,
     /// One entry per setting, hottest temperature first.
     pub settings: Vec<SettingResult>,
     /// The comparisons that a verifier has to stand.
@@ -90,25 +89,29 @@ pub struct StepTime {
 type BySetting<'a> = Vec<(Setting, Vec<&'a EpisodeSummary>)>;
 
 impl Results {
-    /// Counts the episodes of a run and the attempts that broke.
-    pub fn new(summaries: &[EpisodeSummary], faults: &[FaultRecord]) -> Result<Results> {
+    /// Counts the episodes of a run and the attempts that broke; `order` are the run's tasks, see [`tasks_in_order`].
+    pub fn new(
+        summaries: &[EpisodeSummary],
+        faults: &[FaultRecord],
+        order: &[TaskId],
+    ) -> Result<Results> {
         let mut by_setting: BySetting = Vec::new();
         for summary in summaries {
             of_setting(&mut by_setting, summary.identity.setting()?).push(summary);
         }
-        let mut broken: Vec<(Setting, &str)> = Vec::new();
+        let mut broken: Vec<(Setting, TaskId)> = Vec::new();
         for fault in faults {
             let setting = fault.identity.setting()?;
             // An setting of which every attempt broke still has its row.
             of_setting(&mut by_setting, setting);
-            broken.push((setting, &fault.identity.task));
+            broken.push((setting, fault.identity.task_id()));
         }
         by_setting.sort_by(|(a, _), (b, _)| {
             let by_temperature = b.temperature.total_cmp(&a.temperature);
             by_temperature.then(a.strategy.cmp(&b.strategy)).then(a.candidates.cmp(&b.candidates))
         });
-        let names = summaries.iter().map(|summary| &summary.identity.task);
-        let tasks = in_order(names.chain(faults.iter().map(|fault| &fault.identity.task)));
+        let ran = summaries.iter().map(|summary| summary.identity.task_id());
+        let tasks = in_order(ran.chain(broken.iter().map(|(_, task)| task.clone())), order);
         Ok(Results {
             gains: gains(&by_setting, &tasks),
             headroom: headroom(&by_setting),
@@ -124,7 +127,10 @@ impl Results {
     }
 }
 
-fn of_setting<'a, 'b>(by_setting: &'b mut BySetting<'a>, setting: Setting) -> &'b mut Vec<&'a EpisodeSummary> {
+fn of_setting<'a, 'b>(
+    by_setting: &'b mut BySetting<'a>,
+    setting: Setting,
+) -> &'b mut Vec<&'a EpisodeSummary> {
     let place = by_setting.iter().position(|(known, _)| *known == setting).unwrap_or_else(|| {
         by_setting.push((setting, Vec::new()));
         by_setting.len() - 1
@@ -132,22 +138,33 @@ fn of_setting<'a, 'b>(by_setting: &'b mut BySetting<'a>, setting: Setting) -> &'
     &mut by_setting[place].1
 }
 
-/// The known tasks in their usual order, then any others by name.
-fn in_order<'a>(names: impl Iterator<Item = &'a String>) -> Vec<String> {
-    let mut names: BTreeSet<&str> = names.map(String::as_str).collect();
-    let known: Vec<&str> = TASKS.into_iter().filter(|task| names.remove(task)).collect();
-    known.into_iter().chain(names).map(str::to_owned).collect()
+/// The tasks that a run was asked for, from its options: the order of its tables.
+pub fn tasks_in_order(options: &Value) -> Vec<TaskId> {
+    let names = options["tasks"].as_array().map_or(&[][..], Vec::as_slice);
+    names.iter().filter_map(|name| name.as_str()?.parse().ok()).collect()
+}
+
+/// Each task once: those of `order` first, then any others by name.
+fn in_order(tasks: impl Iterator<Item = TaskId>, order: &[TaskId]) -> Vec<TaskId> {
+    let mut tasks: BTreeSet<TaskId> = tasks.collect();
+    let mut ordered: Vec<TaskId> = order.iter().filter_map(|task| tasks.take(task)).collect();
+    ordered.extend(tasks);
+    ordered
 }
 
 fn setting_result(
     setting: Setting,
     list: &[&EpisodeSummary],
-    broken: &[(Setting, &str)],
-    tasks: &[String],
+    broken: &[(Setting, TaskId)],
+    tasks: &[TaskId],
 ) -> SettingResult {
-    let of_task = |task: &String| {
-        let faults = broken.iter().filter(|(other, name)| *other == setting && name == task).count();
-        rates(list.iter().copied().filter(|summary| summary.identity.task == *task), faults as u64)
+    let of_task = |task: &TaskId| {
+        let faults =
+            broken.iter().filter(|(other, name)| *other == setting && name == task).count();
+        rates(
+            list.iter().copied().filter(|summary| summary.identity.task_id() == *task),
+            faults as u64,
+        )
     };
     let faults = broken.iter().filter(|(other, _)| *other == setting).count();
     SettingResult {
@@ -171,9 +188,10 @@ fn rates<'a>(summaries: impl Iterator<Item = &'a EpisodeSummary> + Clone, faults
 }
 
 /// The verifier against everything that costs less to have, and with agreement against agreement alone.
-fn gains(by_setting: &BySetting, tasks: &[String]) -> Vec<SettingGain> {
-    let is_verifier =
-        |setting: &Setting| matches!(setting.strategy, Strategy::Verifier | Strategy::VerifierMedoid);
+fn gains(by_setting: &BySetting, tasks: &[TaskId]) -> Vec<SettingGain> {
+    let is_verifier = |setting: &Setting| {
+        matches!(setting.strategy, Strategy::Verifier | Strategy::VerifierMedoid)
+    };
     let mut gains = Vec::new();
     for (better, ours) in by_setting.iter().filter(|(setting, _)| is_verifier(setting)) {
         for (worse, theirs) in by_setting {
@@ -181,9 +199,10 @@ fn gains(by_setting: &BySetting, tasks: &[String]) -> Vec<SettingGain> {
             let is_compared = match worse.strategy {
                 Strategy::Greedy => true,
                 Strategy::Sample => same_temperature,
-                Strategy::Majority | Strategy::Medoid | Strategy::Worst => {
-                    same_temperature && worse.candidates == better.candidates
-                }
+                Strategy::FirstWellFormed
+                | Strategy::Majority
+                | Strategy::Medoid
+                | Strategy::Worst => same_temperature && worse.candidates == better.candidates,
                 Strategy::Verifier => {
                     better.strategy == Strategy::VerifierMedoid
                         && same_temperature
@@ -200,15 +219,15 @@ fn gains(by_setting: &BySetting, tasks: &[String]) -> Vec<SettingGain> {
 }
 
 /// None when some task of the run has no pair yet: an average over other tasks would be another quantity.
-fn gain(ours: &[&EpisodeSummary], theirs: &[&EpisodeSummary], tasks: &[String]) -> Option<Gain> {
+fn gain(ours: &[&EpisodeSummary], theirs: &[&EpisodeSummary], tasks: &[TaskId]) -> Option<Gain> {
     let place = |summary: &EpisodeSummary| {
         let identity = &summary.identity;
         (identity.task.clone(), identity.variant.clone(), identity.episode)
     };
     let theirs: BTreeMap<_, f64> =
         theirs.iter().map(|summary| (place(summary), success(summary))).collect();
-    let of_task = |task: &String| {
-        let ours = ours.iter().filter(|summary| summary.identity.task == *task);
+    let of_task = |task: &TaskId| {
+        let ours = ours.iter().filter(|summary| summary.identity.task_id() == *task);
         let pair =
             |summary: &&EpisodeSummary| Some(success(summary) - theirs.get(&place(summary))?);
         ours.filter_map(pair).collect()
@@ -257,8 +276,14 @@ fn step_time(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use store::record::EpisodeIdentity;
     use protocol::Statistics;
+    use store::record::EpisodeIdentity;
+
+    const TASKS: [&str; 2] = ["widowx_spoon_on_towel", "widowx_carrot_on_plate"];
+
+    fn order() -> Vec<TaskId> {
+        TASKS.map(TaskId::default_of).to_vec()
+    }
 
     fn identity(task: &str, episode: u32, strategy: Strategy) -> EpisodeIdentity {
         let setting = Setting::new(strategy, 5, 1.0);
@@ -307,9 +332,10 @@ mod tests {
 
     #[test]
     fn rates_gains_and_headroom_of_known_outcomes() {
-        let results = Results::new(&made_up(), &[]).expect("results");
-        assert_eq!(results.tasks, [TASKS[0], TASKS[1]], "the usual order");
-        let strategies: Vec<_> = results.settings.iter().map(|setting| setting.setting.strategy).collect();
+        let results = Results::new(&made_up(), &[], &order()).expect("results");
+        assert_eq!(results.tasks, order(), "the order of the options");
+        let strategies: Vec<_> =
+            results.settings.iter().map(|setting| setting.setting.strategy).collect();
         assert_eq!(strategies, [Strategy::Sample, Strategy::Verifier, Strategy::Oracle]);
         assert_eq!(results.settings[0].all.success, Rate { successes: 2, trials: 8 });
         assert_eq!(results.settings[1].tasks[0].success, Rate { successes: 2, trials: 4 });
@@ -319,7 +345,9 @@ mod tests {
             (Strategy::Verifier, Strategy::Sample)
         );
         assert_eq!((gain.gain.mean, gain.gain.pairs), (0.25, 8));
-        let [headroom] = &results.headroom[..] else { panic!("one setting: {:?}", results.headroom) };
+        let [headroom] = &results.headroom[..] else {
+            panic!("one setting: {:?}", results.headroom)
+        };
         assert!((headroom.fraction - 1.0 / 3.0).abs() < 1e-12);
         assert_eq!(results.decision_ms.map(|time| time.p50), Some(15.0));
         assert_eq!(results.step_ms.map(|time| time.p95), Some(6.0));
@@ -334,7 +362,7 @@ mod tests {
             server: "s".into(),
             reason: "lost".into(),
         };
-        let results = Results::new(&made_up(), &[fault]).expect("results");
+        let results = Results::new(&made_up(), &[fault], &order()).expect("results");
         assert_eq!(results.settings[0].tasks[0].faults, 1);
         assert_eq!(results.settings[0].tasks[1].faults, 0);
         assert_eq!(results.settings[0].all.success, Rate { successes: 2, trials: 8 });
@@ -344,12 +372,12 @@ mod tests {
     fn only_common_episodes_are_paired() {
         let mut summaries = made_up();
         summaries.push(summary(TASKS[0], 9, Strategy::Verifier, true));
-        let results = Results::new(&summaries, &[]).expect("results");
+        let results = Results::new(&summaries, &[], &order()).expect("results");
         assert_eq!(results.gains[0].gain.pairs, 8);
         // Without any pair in one task there is no average over all tasks.
         summaries.retain(|one| {
             one.identity.task != TASKS[1] || one.identity.strategy != Strategy::Sample.name()
         });
-        assert!(Results::new(&summaries, &[]).expect("results").gains.is_empty());
+        assert!(Results::new(&summaries, &[], &order()).expect("results").gains.is_empty());
     }
 }

@@ -2,7 +2,7 @@
 
 use rand::Rng;
 use rand::SeedableRng;
-use rand::rngs::StdRng;
+use rand_chacha::ChaCha8Rng;
 
 /// The two-sided 95 % point of the normal distribution: every interval of this project is a 95 % interval.
 const NORMAL_95: f64 = 1.959_963_984_540_054;
@@ -90,7 +90,7 @@ pub fn paired_bootstrap(differences: &[Vec<f64>], resamples: usize, seed: u64) -
     let tasks = differences.len() as f64;
     let task_mean = |task: &Vec<f64>| task.iter().sum::<f64>() / task.len() as f64;
     let mean = differences.iter().map(task_mean).sum::<f64>() / tasks;
-    let mut random = StdRng::seed_from_u64(seed);
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut resample = || {
         let sums = differences.iter().map(|task| {
             let drawn: f64 =
@@ -254,7 +254,7 @@ mod tests {
         assert_eq!(auroc(&[0.1, 0.4, 0.35, 0.8], &[false, false, true, true]), Some(0.75));
         assert_eq!(auroc(&[0.3; 4], &[false, false, true, true]), Some(0.5));
         assert_eq!(auroc(&[0.1, 0.2], &[true, true]), None);
-        let mut random = StdRng::seed_from_u64(5);
+        let mut random = ChaCha8Rng::seed_from_u64(5);
         let scores: Vec<f32> = (0..60).map(|_| random.random_range(0..12) as f32).collect();
         let labels: Vec<bool> = (0..60).map(|_| random.random_bool(0.4)).collect();
         let found = auroc(&scores, &labels).expect("both classes");

@@ -51,8 +51,7 @@ impl Suite {
         let place = mixed("place", task, episode, self.seed);
         EpisodePlan {
             task: task.clone(),
-            layout: (self.layouts == Layouts::Grid)
-                .then_some(episode % LAYOUTS),
+            layout: (self.layouts == Layouts::Grid).then_some(episode % LAYOUTS),
             episode,
             seed: self.range.first() + place % SEEDS_PER_RANGE,
             // Every reader of a record, JavaScript included, must hold this number exactly.

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use crate::results::{SettingResult, Rates, Results, StepTime};
+use crate::results::{Rates, Results, SettingResult, StepTime};
 use crate::statistics::Rate;
 use decision::Strategy;
 
@@ -19,9 +19,10 @@ fn rates(results: &Results) -> String {
             .map(str::to_owned)
             .to_vec(),
     ];
-    let blocks = results.tasks.iter().enumerate().map(|(index, task)| (task.as_str(), Some(index)));
-    for (title, index) in blocks.chain([("average", None)]) {
-        rows.push(vec![title.to_owned()]);
+    let blocks =
+        results.tasks.iter().enumerate().map(|(index, task)| (task.to_string(), Some(index)));
+    for (title, index) in blocks.chain([("average".to_owned(), None)]) {
+        rows.push(vec![title]);
         for result in &results.settings {
             rows.push(rate_row(result, index.map_or(&result.all, |index| &result.tasks[index])));
         }
@@ -59,7 +60,8 @@ fn gains(results: &Results) -> String {
         ]);
     }
     for headroom in &results.headroom {
-        let title = format!("  {}: part of the way from one sample to the oracle", headroom.setting);
+        let title =
+            format!("  {}: part of the way from one sample to the oracle", headroom.setting);
         rows.push(vec![title, format!("{:.0} %", 100.0 * headroom.fraction)]);
     }
     aligned(&rows)
@@ -71,8 +73,12 @@ fn by_candidates(results: &Results) -> String {
         vec![["success against N", "N", "success %", "95 %"].map(str::to_owned).to_vec()];
     for strategy in Strategy::ALL {
         let of_strategy = |result: &&SettingResult| result.setting.strategy == strategy;
-        let mut temperatures: Vec<f32> =
-            results.settings.iter().filter(of_strategy).map(|result| result.setting.temperature).collect();
+        let mut temperatures: Vec<f32> = results
+            .settings
+            .iter()
+            .filter(of_strategy)
+            .map(|result| result.setting.temperature)
+            .collect();
         temperatures.dedup();
         for temperature in temperatures {
             let is_point = |result: &&SettingResult| {

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use decision::{TaskId, VARIANT_DEFAULT};
 use serde::Serialize;
 
 use store::run::EpisodeSummary;
@@ -48,7 +49,7 @@ impl Catalogue {
             let id = identity.id();
             episodes.push(Entry {
                 pair: *pairs.entry(place).or_insert(count),
-                task: task_words(&identity.task),
+                task: task_words(&identity.task_id()),
                 layout: match identity.layout {
                     Some(layout) => format!("grid {layout}"),
                     None => format!("random {}", identity.episode),
@@ -74,9 +75,13 @@ impl Catalogue {
 }
 
 /// A task's name for people: `widowx_spoon_on_towel` is "spoon on towel".
-pub fn task_words(task: &str) -> String {
-    let name = task.strip_prefix("widowx_").unwrap_or(task);
-    name.strip_prefix("put_").unwrap_or(name).replace('_', " ")
+pub fn task_words(id: &TaskId) -> String {
+    let name = id.task.strip_prefix("widowx_").unwrap_or(&id.task);
+    let name = name.strip_prefix("put_").unwrap_or(name).replace('_', " ");
+    match id.variant.as_str() {
+        VARIANT_DEFAULT => name,
+        variant => format!("{name} ({variant})"),
+    }
 }
 
 /// Layouts in order of their numbers, the settings of one layout together.
@@ -143,7 +148,11 @@ mod tests {
 
     #[test]
     fn tasks_are_named_for_people() {
-        assert_eq!(task_words("widowx_put_eggplant_in_basket"), "eggplant in basket");
-        assert_eq!(task_words("widowx_stack_cube"), "stack cube");
+        assert_eq!(
+            task_words(&TaskId::default_of("widowx_put_eggplant_in_basket")),
+            "eggplant in basket"
+        );
+        let variant = TaskId::new("widowx_stack_cube", "distractors");
+        assert_eq!(task_words(&variant), "stack cube (distractors)");
     }
 }

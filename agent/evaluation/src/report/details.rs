@@ -3,9 +3,10 @@
 use std::collections::HashMap;
 
 use anyhow::Context;
+use decision::{Action, Reasoning};
 use serde::Serialize;
 
-use store::record::{CandidateRecord, EpisodeRecord, StepRecord};
+use store::record::{CandidateRecord, DecisionRecord, EpisodeRecord, StepRecord};
 
 use super::Speech;
 
@@ -22,7 +23,8 @@ struct Step {
     chosen: Option<u32>,
     /// One bit per statistic, in the page's order.
     flags: u16,
-    decision_ms: f32,
+    /// None for a step that executes a further action of the chunk decided before.
+    decision_ms: Option<f32>,
     candidates: Vec<Candidate>,
 }
 
@@ -33,7 +35,8 @@ enum Candidate {
     Said {
         score: Option<f64>,
         log: f64,
-        action: [f64; 7],
+        /// One list of numbers per action of the chunk.
+        actions: Vec<Vec<f64>>,
         /// Task, plan, subtask reasoning, subtask, move reasoning, move.
         says: [usize; 6],
         /// Name, left, top, right, bottom.
@@ -81,7 +84,9 @@ fn step(
     speak: &dyn Fn(&[u32]) -> Speech,
     phrases: &mut Phrases,
 ) -> anyhow::Result<Step> {
-    let candidates = step.candidates.iter().map(|one| candidate(one, speak(&one.tokens), phrases));
+    let decision = step.decision.as_ref();
+    let candidates = decision.map_or(&[][..], |decision| &decision.candidates);
+    let candidates = candidates.iter().map(|one| candidate(one, speak, phrases));
     let statistics = &step.statistics;
     let flags = [
         statistics.is_grasped,
@@ -95,21 +100,26 @@ fn step(
         statistics.released_success,
     ];
     Ok(Step {
-        chosen: step.chosen,
+        chosen: decision.and_then(|decision| decision.chosen),
         flags: flags.iter().rev().fold(0, |bits, flag| bits << 1 | u16::from(*flag)),
-        decision_ms: step.decision_ms,
+        decision_ms: decision.map(DecisionRecord::milliseconds),
         candidates: candidates.collect::<anyhow::Result<_>>()?,
     })
 }
 
 fn candidate(
     record: &CandidateRecord,
-    speech: Speech,
+    speak: &dyn Fn(&[u32]) -> Speech,
     phrases: &mut Phrases,
 ) -> anyhow::Result<Candidate> {
+    // A policy that tells no tokens has no text and no reasoning.
+    let speech = match record.tokens.is_empty() {
+        true => Speech { text: String::new(), reasoning: Some(Reasoning::default()) },
+        false => speak(&record.tokens),
+    };
     let score = record.score.map(|score| rounded(score, 6));
     let log = rounded(record.log_probability, 2);
-    let Some(action) = record.action else {
+    let Some(actions) = &record.actions else {
         let reason = record.malformed.clone().context("a malformed candidate has a reason")?;
         let malformed = phrases.number(reason);
         return Ok(Candidate::Malformed {
@@ -138,11 +148,15 @@ fn candidate(
     Ok(Candidate::Said {
         score,
         log,
-        action: action.map(|value| rounded(value, 5)),
+        actions: actions.actions().iter().map(numbers).collect(),
         says: says.map(|phrase| phrases.number(phrase)),
         boxes,
         gripper: reasoning.gripper_position,
     })
+}
+
+fn numbers(action: &Action) -> Vec<f64> {
+    action.iter().map(|value| rounded(*value, 5)).collect()
 }
 
 fn rounded(value: f32, digits: i32) -> f64 {

@@ -32,9 +32,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use serde::Serialize;
 
+use crate::results::{Results, tasks_in_order};
 use decision::Reasoning;
 use store::record::EpisodeRecord;
-use crate::results::Results;
 use store::run;
 
 use catalogue::Catalogue;
@@ -93,7 +93,7 @@ pub fn build(
     for (done, entry) in catalogue.episodes.iter().enumerate() {
         progress(done, catalogue.episodes.len());
         let record = EpisodeRecord::read(&run::record_path(options.run, &entry.id))?;
-        scored.extend(chosen_scores(&record));
+        scored.extend(chosen_scores(&record)?);
         simulators.insert(record.versions.simulator.clone());
         if detailed.contains(entry.id.as_str()) {
             let details = Details::new(&record, speak)?;
@@ -107,7 +107,8 @@ pub fn build(
     for (name, text) in page::FILES {
         folder.write(name, text.as_bytes())?;
     }
-    let results = Results::new(&summaries, &run::faults(options.run)?)?;
+    let results =
+        Results::new(&summaries, &run::faults(options.run)?, &tasks_in_order(&header.options))?;
     folder.write(
         "index.html",
         sections::page(&header, &simulators, &results, &scored).html()?.as_bytes(),
@@ -124,13 +125,13 @@ pub fn build(
 }
 
 /// The scores of executed candidates, with what became of their episode.
-fn chosen_scores(record: &EpisodeRecord) -> Vec<Scored> {
-    let is_selected = record.identity.candidates > 1;
-    let chosen = record.steps.iter().filter_map(|step| {
-        let score = step.candidates.get(step.chosen? as usize)?.score?;
+fn chosen_scores(record: &EpisodeRecord) -> anyhow::Result<Vec<Scored>> {
+    let is_selected = record.identity.setting()?.strategy.compares_candidates();
+    let chosen = record.decisions().filter_map(|decision| {
+        let score = decision.candidates.get(decision.chosen? as usize)?.score?;
         Some(Scored { score, is_success: record.statistics.is_success, is_selected })
     });
-    chosen.collect()
+    Ok(chosen.collect())
 }
 
 /// The report's folder while it is written.

@@ -3,18 +3,21 @@
 use std::path::Path;
 
 use protocol::Statistics;
-use rand::rngs::StdRng;
 use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use serde_json::json;
 
 use super::Speech;
-use decision::{Reasoning, VisibleObject};
-use store::record::{CandidateRecord, EpisodeIdentity, EpisodeRecord, RECORD_VERSION, StepRecord, Versions};
+use decision::{ActionChunk, Reasoning, VisibleObject};
+use store::record::{
+    CandidateRecord, DecisionRecord, EpisodeIdentity, EpisodeRecord, RECORD_VERSION, StepRecord,
+    Versions,
+};
 use store::run::{EpisodeSummary, Run};
 use store::video::Video;
 
 const TASKS: [&str; 2] = ["widowx_spoon_on_towel", "widowx_stack_cube"];
-const ARMS: [(&str, u32); 3] = [("greedy", 1), ("sample", 1), ("verifier", 5)];
+const SETTINGS: [(&str, u32); 3] = [("greedy", 1), ("sample", 1), ("verifier", 5)];
 const EPISODES: u32 = 4;
 const STEPS: usize = 60;
 
@@ -41,11 +44,11 @@ pub fn speak(tokens: &[u32]) -> Speech {
 
 /// All records of the made-up run.
 pub fn records() -> Vec<EpisodeRecord> {
-    let mut random = StdRng::seed_from_u64(11);
+    let mut random = ChaCha8Rng::seed_from_u64(11);
     let mut records = Vec::new();
     for task in TASKS {
         for episode in 0..EPISODES {
-            for (strategy, candidates) in ARMS {
+            for (strategy, candidates) in SETTINGS {
                 let chance = if strategy == "verifier" { 0.6 } else { 0.35 };
                 let identity = identity(task, episode, strategy, candidates);
                 records.push(record(identity, random.random_bool(chance), &mut random));
@@ -94,7 +97,7 @@ fn identity(task: &str, episode: u32, strategy: &str, candidates: u32) -> Episod
     }
 }
 
-fn record(identity: EpisodeIdentity, is_success: bool, random: &mut StdRng) -> EpisodeRecord {
+fn record(identity: EpisodeIdentity, is_success: bool, random: &mut ChaCha8Rng) -> EpisodeRecord {
     let steps: Vec<StepRecord> = (0..STEPS)
         .map(|step| {
             let late = is_success && step > 45;
@@ -103,16 +106,20 @@ fn record(identity: EpisodeIdentity, is_success: bool, random: &mut StdRng) -> E
             let made: Vec<CandidateRecord> =
                 (0..identity.candidates).map(|_| candidate(level, random)).collect();
             StepRecord {
-                state: [0.0; 8],
-                chosen: (0..)
-                    .zip(&made)
-                    .find(|(_, one)| one.action.is_some())
-                    .map(|(index, _)| index),
-                candidates: made,
+                state: vec![0.0; 8],
+                action: vec![0.0; 7],
+                decision: Some(DecisionRecord {
+                    chosen: (0..)
+                        .zip(&made)
+                        .find(|(_, one)| one.actions.is_some())
+                        .map(|(index, _)| index),
+                    candidates: made,
+                    batch_ms: 86.0,
+                    batch_size: 4,
+                }),
                 statistics: statistics(late, grasped),
-                decision_ms: 21.5,
                 step_ms: 4.25,
-                simulator_ms: Some(3.75),
+                simulator_ms: 3.75,
             }
         })
         .collect();
@@ -134,13 +141,14 @@ fn record(identity: EpisodeIdentity, is_success: bool, random: &mut StdRng) -> E
     }
 }
 
-fn candidate(level: f32, random: &mut StdRng) -> CandidateRecord {
+fn candidate(level: f32, random: &mut ChaCha8Rng) -> CandidateRecord {
     let tokens: Vec<u32> = (0..3).map(|_| random.random_range(0..200)).collect();
     let is_well_formed = speak(&tokens).reasoning.is_some();
     let mut coordinate = || random.random_range(-0.02..0.02);
-    let action = [coordinate(), coordinate(), coordinate(), coordinate(), 0.0, coordinate(), 1.0];
+    let action =
+        vec![coordinate(), coordinate(), coordinate(), coordinate(), 0.0, coordinate(), 1.0];
     CandidateRecord {
-        action: is_well_formed.then_some(action),
+        actions: is_well_formed.then(|| ActionChunk::single(action).expect("finite numbers")),
         malformed: (!is_well_formed).then(|| "expected 7 action tokens, got </s>".to_owned()),
         score: is_well_formed.then(|| (level + random.random_range(-0.2..0.2)).clamp(0.0, 1.0)),
         log_probability: -12.5,

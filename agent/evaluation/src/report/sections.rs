@@ -12,10 +12,10 @@ use super::page::Page;
 use super::scores::{Bin, Scored};
 use super::{bars, curve, forest, scores};
 use crate::calibration;
-use crate::results::{SettingGain, SettingResult, Rates, Results, StepTime};
-use store::run::RunHeader;
+use crate::results::{Rates, Results, SettingGain, SettingResult, StepTime};
 use crate::statistics::{Rate, auroc};
-use decision::Strategy;
+use decision::{Strategy, TaskId};
+use store::run::RunHeader;
 
 /// A digest is known by its beginning.
 const VERSION_LETTERS: usize = 16;
@@ -108,7 +108,11 @@ fn headline(results: &Results) -> String {
     let setting = |setting| results.settings.iter().find(|result| result.setting == setting);
     let Some(main) = main else {
         return results.settings.first().map_or_else(String::new, |first| {
-            format!("{} succeeds in {}.", html(&first.setting.to_string()), percent(first.all.success))
+            format!(
+                "{} succeeds in {}.",
+                html(&first.setting.to_string()),
+                percent(first.all.success)
+            )
         });
     };
     let (Some(better), Some(worse)) = (setting(main.better), setting(main.worse)) else {
@@ -300,9 +304,12 @@ fn tasks(results: &Results) -> String {
     if results.tasks.len() < 2 {
         return String::new();
     }
-    let figure = |(index, task): (usize, &String)| {
-        let bars: Vec<Bar> =
-            results.settings.iter().filter_map(|setting| bar(setting, setting.tasks[index].success)).collect();
+    let figure = |(index, task): (usize, &TaskId)| {
+        let bars: Vec<Bar> = results
+            .settings
+            .iter()
+            .filter_map(|setting| bar(setting, setting.tasks[index].success))
+            .collect();
         format!("<div><h3>{}</h3>{}</div>", html(&task_words(task)), bars::figure(&bars))
     };
     let figures: String = results.tasks.iter().enumerate().map(figure).collect();

@@ -43,10 +43,11 @@ fn every_episode_of_the_run_is_in_the_report() {
         let steps = details["steps"].as_array().expect("steps");
         assert_eq!(steps.len(), record.steps.len());
         for (step, recorded) in steps.iter().zip(&record.steps) {
-            assert_eq!(step["chosen"], recorded.chosen.map_or(Value::Null, Value::from));
+            let decision = recorded.decision.as_ref().expect("a decision");
+            assert_eq!(step["chosen"], decision.chosen.map_or(Value::Null, Value::from));
             assert_eq!(
                 step["candidates"].as_array().expect("list").len(),
-                recorded.candidates.len()
+                decision.candidates.len()
             );
             assert_eq!(
                 step["flags"].as_u64().expect("bits") & 1 == 1,
@@ -69,7 +70,9 @@ fn candidates_keep_their_words_and_malformed_ones_their_reason() {
         |number: &Value| details["phrases"][number.as_u64().expect("number") as usize].clone();
     let mut malformed = 0;
     for (step, recorded) in record.steps.iter().enumerate() {
-        for (index, candidate) in recorded.candidates.iter().enumerate() {
+        for (index, candidate) in
+            recorded.decision.iter().flat_map(|one| &one.candidates).enumerate()
+        {
             let shown = &details["steps"][step]["candidates"][index];
             let speech = sample::speak(&candidate.tokens);
             match speech.reasoning {

@@ -136,11 +136,16 @@
       return;
     }
     const step = steps[frame];
+    if (step.decision_ms === null) {
+      overlay.replaceChildren();
+      column.replaceChildren(element("p", "summary", "No decision here: a further action of the chunk decided before."));
+      return;
+    }
     const drawnIndex = shown ?? step.chosen;
     drawOverlay(overlay, drawnIndex === null ? null : step.candidates[drawnIndex], phrases);
     const plural = step.candidates.length === 1 ? "candidate" : "candidates";
     const held = step.chosen === null ? " · none is well formed: the robot held still" : "";
-    const text = `${step.candidates.length} ${plural} · decided with its batch in ${decimal(step.decision_ms, 0)} ms${held}`;
+    const text = `${step.candidates.length} ${plural} · decided in ${decimal(step.decision_ms, 1)} ms (its share of its batch)${held}`;
     const choose = (index) => {
       shown = index;
       drawStep(steps, phrases);

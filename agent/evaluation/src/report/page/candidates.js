@@ -28,7 +28,7 @@ function standing(candidate, candidates) {
   const scores = candidates.filter((one) => one.malformed === undefined && one.score !== null).map((one) => one.score);
   if (scores.length < 2 || candidate.malformed !== undefined) return "";
   const best = Math.max(...scores);
-  return candidate.score === best ? " (best)" : ` (${decimal(100 * (candidate.score - best), 3)} points)`;
+  return candidate.score === best ? " (best)" : ` (${decimal(100 * (candidate.score - best), 3)} percentage points)`;
 }
 
 function candidateHead(candidate, index, isChosen, candidates) {
@@ -49,6 +49,7 @@ function candidateHead(candidate, index, isChosen, candidates) {
   return head;
 }
 
+// Seven numbers are a Bridge action: metres, radians, gripper. Others are shown as they are.
 function actionLine(action) {
   const line = element("div", "action");
   const part = (label, text) => {
@@ -56,6 +57,10 @@ function actionLine(action) {
     item.append(element("b", "", text));
     line.append(item);
   };
+  if (action.length !== 7) {
+    part("action", action.map((value) => decimal(value, 3)).join("  "));
+    return line;
+  }
   const list = (values, scale) => values.map((value) => decimal(value * scale, 1)).join("  ");
   part("move (mm)", list(action.slice(0, 3), 1000));
   part("turn (°)", list(action.slice(3, 6), 180 / Math.PI));
@@ -88,7 +93,7 @@ function candidateCards(step, phrases, shown, show) {
       card.append(element("div", "note", phrases[candidate.malformed]));
       card.append(element("div", "raw mono", phrases[candidate.text].trim()));
     } else {
-      card.append(actionLine(candidate.action));
+      card.append(...candidate.actions.map(actionLine));
       card.append(tagList(sections(candidate, phrases), isChosen ? null : reference));
     }
     card.addEventListener("click", () => show(index));
