@@ -30,6 +30,8 @@ pub struct EpisodeRecord {
     pub versions: Versions,
     /// The instruction as the policy read it.
     pub instruction: String,
+    /// The task's horizon: control steps after which an episode is truncated.
+    pub steps_max: u32,
     /// As of the last step; success is read here.
     pub statistics: Statistics,
     /// One entry per control step, in order.
@@ -297,6 +299,7 @@ pub(crate) mod tests {
                 verifier: Some("beef".into()),
             },
             instruction: "stack the green cube on the yellow cube".into(),
+            steps_max: 60,
             statistics: Statistics {
                 is_success: episode.is_multiple_of(2),
                 ..Statistics::default()
