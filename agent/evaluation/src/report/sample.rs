@@ -127,6 +127,7 @@ fn record(identity: EpisodeIdentity, is_success: bool, random: &mut ChaCha8Rng) 
     EpisodeRecord {
         version: RECORD_VERSION,
         instruction: "put the spoon on the towel".into(),
+        steps_max: 60,
         versions: Versions {
             rever: "0.0.0".into(),
             protocol: 1,
