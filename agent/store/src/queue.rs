@@ -1,152 +1,154 @@
-//! What is still to be run: planned episodes that have no record yet.
+//! The queue of episodes that are still to be run: leases, attempts, and what is given up.
+//!
+//! A worker leases an episode, renews its lease while the episode runs, and in the end completes it, fails it, or releases it
+//! unbegun. Only an implementation knows who holds a lease and when one expires: the queue of a run folder lives as long as
+//! its process, the queue of a fleet outlives its workers.
 
-use std::collections::{BTreeSet, VecDeque};
+mod run_queue;
+#[cfg(any(test, feature = "scripted"))]
+mod scripted;
 
+use std::fmt;
+
+use anyhow::Result;
+use async_trait::async_trait;
 use decision::Setting;
+use serde::{Deserialize, Serialize};
 
-use crate::plan::EpisodePlan;
+pub use run_queue::RunQueue;
+#[cfg(any(test, feature = "scripted"))]
+pub use scripted::{QueueEvent, ScriptedQueue};
+
 use crate::record::EpisodeIdentity;
 
-/// Attempts at one episode by one process. A fault that comes back every time is not the server's.
+/// Faults of an episode itself after which it is given up: what fails every time is no accident.
 pub const ATTEMPTS_MAX: u32 = 3;
 
+/// Interruptions by servers and links after which an episode is given up all the same, so that one that brings down every
+/// server which runs it does not hold up a run for ever.
+pub const INTERRUPTIONS_MAX: u32 = 20;
+
+/// Where planned episodes come from, and where it is noted how they ended. Every error is the queue's own.
+#[async_trait]
+pub trait EpisodeQueue: Send + Sync {
+    /// Leases the next episode; none when nothing waits now. Leased episodes may come back, so a queue is only finished
+    /// when [`QueueProgress::is_finished`].
+    async fn lease(&self) -> Result<Option<Lease>>;
+
+    /// Extends a lease; false when it is no longer held, and then its episode must be abandoned without a record.
+    async fn renew(&self, lease: &Lease) -> Result<bool>;
+
+    /// The episode ran to its end and its record is durable.
+    async fn complete(&self, lease: Lease) -> Result<()>;
+
+    /// The episode broke. It is run again after all that wait, or given up.
+    async fn fail(&self, lease: Lease, scope: FaultScope, reason: &str) -> Result<Disposition>;
+
+    /// The episode could not be begun: it is the next one again, and no attempt is lost.
+    async fn release(&self, lease: Lease) -> Result<()>;
+
+    /// How many episodes are in which state.
+    async fn progress(&self) -> Result<QueueProgress>;
+
+    /// Episodes that will not be run again, with every reason, in the order in which they were given up.
+    async fn given_up(&self) -> Result<Vec<GivenUp>>;
+}
+
 /// One episode to be run with one setting.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Job {
     /// Which episode, and how.
     pub identity: EpisodeIdentity,
     /// The same as in the identity, parsed.
     pub setting: Setting,
-    /// 1 for the first attempt.
+    /// 1 for the first attempt; interruptions do not count.
     pub attempt: u32,
 }
 
-/// Jobs in the order in which they are to be run.
-#[derive(Debug)]
-pub struct Queue {
-    waiting: VecDeque<Job>,
-    given_up: Vec<Job>,
+/// The right to run one episode now. It is given back by [`EpisodeQueue::complete`], [`fail`](EpisodeQueue::fail) or
+/// [`release`](EpisodeQueue::release).
+#[derive(Debug, PartialEq)]
+pub struct Lease {
+    /// What is to be run.
+    pub job: Job,
+    /// Tells this lease from every other of its queue, an earlier one of the same episode included.
+    token: u64,
 }
 
-impl Queue {
-    /// Every episode with every setting, episode by episode, so that a partial run is paired; without what is recorded.
-    pub fn new(
-        run: &str,
-        plans: &[EpisodePlan],
-        settings: &[Setting],
-        recorded: &BTreeSet<String>,
-    ) -> Queue {
-        let pairs = plans.iter().flat_map(|plan| settings.iter().map(move |setting| (plan, *setting)));
-        let jobs =
-            pairs.map(|(plan, setting)| Job { identity: identity(run, plan, setting), setting, attempt: 1 });
-        let waiting = jobs.filter(|job| !recorded.contains(&job.identity.id())).collect();
-        Queue { waiting, given_up: Vec::new() }
+/// What a fault says about the episode in which it happened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FaultScope {
+    /// The episode: diverged physics, a policy or a scorer that fails on it.
+    Episode,
+    /// Its server: crashed, frozen, or not doing what it says of itself.
+    Server,
+    /// The network between this process and the server.
+    Link,
+}
+
+impl FaultScope {
+    /// Whether such a fault uses up one of the episode's attempts.
+    pub fn counts_as_attempt(self) -> bool {
+        self == FaultScope::Episode
+    }
+}
+
+/// What becomes of an episode that broke.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Disposition {
+    /// It will be run again.
+    Requeued,
+    /// It will not.
+    GivenUp,
+}
+
+/// How many episodes are in which state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct QueueProgress {
+    /// Not leased, to be run.
+    pub waiting: usize,
+    /// Being run, here or elsewhere.
+    pub leased: usize,
+    /// With a record, those from before this process started included.
+    pub completed: usize,
+    /// Not to be run again by this queue.
+    pub given_up: usize,
+}
+
+impl QueueProgress {
+    /// Whether nothing is left to be run.
+    pub fn is_finished(&self) -> bool {
+        self.waiting == 0 && self.leased == 0
     }
 
-    /// Takes the next job.
-    pub fn take(&mut self) -> Option<Job> {
-        self.waiting.pop_front()
+    /// Episodes without a record.
+    pub fn missing(&self) -> usize {
+        self.waiting + self.leased + self.given_up
     }
 
-    /// Puts a job back that could not even be begun; it has lost no attempt.
-    pub fn put_back(&mut self, job: Job) {
-        self.waiting.push_front(job);
+    /// All episodes.
+    pub fn planned(&self) -> usize {
+        self.missing() + self.completed
     }
+}
 
-    /// Takes back a job that broke: it is run again after the others, or given up.
-    pub fn broke(&mut self, job: Job) {
-        if job.attempt < ATTEMPTS_MAX {
-            self.waiting.push_back(Job { attempt: job.attempt + 1, ..job });
-        } else {
-            self.given_up.push(job);
+/// An episode that is not run again, and why.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GivenUp {
+    /// Which episode.
+    pub identity: EpisodeIdentity,
+    /// What happened each time, first to last.
+    pub reasons: Vec<String>,
+}
+
+impl fmt::Display for GivenUp {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (id, count) = (self.identity.id(), self.reasons.len());
+        write!(formatter, "{id}: given up after {count} faults")?;
+        match self.reasons.last() {
+            Some(last) => write!(formatter, ", the last one: {last}"),
+            None => Ok(()),
         }
-    }
-
-    /// Jobs that wait.
-    pub fn len(&self) -> usize {
-        self.waiting.len()
-    }
-
-    /// Whether nothing waits.
-    pub fn is_empty(&self) -> bool {
-        self.waiting.is_empty()
-    }
-
-    /// Jobs that broke [`ATTEMPTS_MAX`] times.
-    pub fn given_up(&self) -> &[Job] {
-        &self.given_up
-    }
-}
-
-fn identity(run: &str, plan: &EpisodePlan, setting: Setting) -> EpisodeIdentity {
-    EpisodeIdentity {
-        run: run.to_owned(),
-        task: plan.task.task.clone(),
-        variant: plan.task.variant.clone(),
-        layout: plan.layout,
-        episode: plan.episode,
-        seed: plan.seed,
-        sampling_seed: plan.sampling_seed,
-        strategy: setting.strategy.to_string(),
-        candidates: setting.candidates,
-        temperature: setting.temperature,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use decision::{Strategy, TaskId};
-
-    fn queue(recorded: &[&str]) -> Queue {
-        let plan = |(episode, task): (u32, &str)| EpisodePlan {
-            task: TaskId::default_of(task),
-            layout: Some(episode),
-            episode,
-            seed: 3,
-            sampling_seed: 4,
-        };
-        let plans = [(0, "a"), (0, "b"), (1, "a"), (1, "b")].map(plan);
-        let settings = Setting::all(&[Strategy::Greedy, Strategy::Verifier], &[1.0], &[5]);
-        let recorded = recorded.iter().map(|id| (*id).to_owned()).collect();
-        Queue::new("run", &plans, &settings, &recorded)
-    }
-
-    fn ids(queue: &mut Queue) -> Vec<String> {
-        std::iter::from_fn(|| queue.take()).map(|job| job.identity.id()).collect()
-    }
-
-    #[test]
-    fn settings_of_an_episode_follow_each_other_and_recorded_ones_are_left_out() {
-        let all = ids(&mut queue(&[]));
-        assert_eq!(all.len(), 8);
-        assert_eq!(all[0], "a-default-0000-greedy-n1-t0");
-        assert_eq!(all[1], "a-default-0000-verifier-n5-t1");
-        assert_eq!(all[2], "b-default-0000-greedy-n1-t0");
-        let rest = ids(&mut queue(&[&all[1], &all[6]]));
-        assert_eq!(rest, [&all[0], &all[2], &all[3], &all[4], &all[5], &all[7]].map(Clone::clone));
-    }
-
-    #[test]
-    fn a_job_that_breaks_is_run_again_last_and_given_up_in_the_end() {
-        let mut queue = queue(&[]);
-        let first = queue.take().expect("a job");
-        let id = first.identity.id();
-        queue.broke(first);
-        assert_eq!(ids_of(&queue).last(), Some(&id));
-        for _ in 0..ATTEMPTS_MAX - 1 {
-            while let Some(job) = queue.take() {
-                if job.identity.id() == id {
-                    queue.broke(job);
-                    break;
-                }
-            }
-        }
-        assert!(queue.is_empty());
-        assert_eq!(queue.given_up().iter().map(|job| job.identity.id()).collect::<Vec<_>>(), [id]);
-    }
-
-    fn ids_of(queue: &Queue) -> Vec<String> {
-        queue.waiting.iter().map(|job| job.identity.id()).collect()
     }
 }

@@ -14,7 +14,6 @@ use half::f16;
 use protocol::Statistics;
 use serde::{Deserialize, Serialize};
 
-
 /// Version of the format; a record of another version is refused.
 pub const RECORD_VERSION: u32 = 4;
 

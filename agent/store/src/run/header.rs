@@ -58,7 +58,9 @@ pub fn settle(folder: &Path, options: Value, versions: Value) -> Result<RunHeade
 /// Adds the settings and episodes that are asked for and not noted yet; whether there were any.
 fn grow(noted: &mut Value, asked: &Value) -> bool {
     let mut grown = false;
-    if let (Some(noted), Some(asked)) = (noted["settings"].as_array_mut(), asked["settings"].as_array()) {
+    if let (Some(noted), Some(asked)) =
+        (noted["settings"].as_array_mut(), asked["settings"].as_array())
+    {
         for setting in asked {
             if !noted.contains(setting) {
                 noted.push(setting.clone());

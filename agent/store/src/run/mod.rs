@@ -193,7 +193,8 @@ impl From<&EpisodeRecord> for EpisodeSummary {
             statistics: record.statistics,
             simulator: record.versions.simulator.clone(),
             steps: record.steps.len() as u32,
-            held_steps: record.decisions().filter(|decision| decision.chosen.is_none()).count() as u32,
+            held_steps: record.decisions().filter(|decision| decision.chosen.is_none()).count()
+                as u32,
             malformed: candidates().filter(|candidate| candidate.malformed.is_some()).count()
                 as u32,
             candidates: candidates().count() as u32,
