@@ -312,6 +312,7 @@ mod tests {
             candidates: 2,
             wall_secs: 1.0,
             decision_ms: vec![10.0, 20.0],
+            batch_size: vec![4, 8],
             step_ms: vec![6.0, 6.0],
             simulator_ms: vec![],
         }
@@ -361,6 +362,7 @@ mod tests {
             attempt: 1,
             server: "s".into(),
             reason: "lost".into(),
+            never_acted: false,
         };
         let results = Results::new(&made_up(), &[fault], &order()).expect("results");
         assert_eq!(results.settings[0].tasks[0].faults, 1);

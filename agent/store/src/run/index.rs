@@ -13,7 +13,7 @@ use crate::record::EpisodeRecord;
 /// The index's file in the run's folder.
 pub const INDEX: &str = "index.sqlite";
 /// Rises when summaries change; an index of another version is rebuilt.
-const INDEX_VERSION: i64 = 2;
+const INDEX_VERSION: i64 = 3;
 /// How long a writer waits for another process that reads.
 const WAIT_SECS: u64 = 30;
 

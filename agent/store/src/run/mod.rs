@@ -75,6 +75,8 @@ pub struct EpisodeSummary {
     pub wall_secs: f32,
     /// Of each decision: its share of its batch's time.
     pub decision_ms: Vec<f32>,
+    /// Of each decision: how many were made together with it, itself included.
+    pub batch_size: Vec<u32>,
     /// Of each step.
     pub step_ms: Vec<f32>,
     /// Of each step.
@@ -93,6 +95,9 @@ pub struct FaultRecord {
     pub server: String,
     /// What happened.
     pub reason: String,
+    /// Whether the episode ran to its end without one well-formed candidate: the policy never acted.
+    #[serde(default)]
+    pub never_acted: bool,
 }
 
 impl Run {
@@ -200,6 +205,7 @@ impl From<&EpisodeRecord> for EpisodeSummary {
             candidates: candidates().count() as u32,
             wall_secs: record.wall_secs,
             decision_ms: record.decisions().map(DecisionRecord::milliseconds).collect(),
+            batch_size: record.decisions().map(|decision| decision.batch_size).collect(),
             step_ms: record.steps.iter().map(|step| step.step_ms).collect(),
             simulator_ms: record.steps.iter().map(|step| step.simulator_ms).collect(),
         }
@@ -318,6 +324,7 @@ mod tests {
             attempt: 1,
             server: "s".into(),
             reason: "lost".into(),
+            never_acted: false,
         };
         run.fault(&fault).expect("noted");
         drop(run);
