@@ -1,6 +1,7 @@
 //! Where the world is: servers on this machine, or at an endpoint.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use tokio::runtime::Runtime;
@@ -21,30 +22,36 @@ pub struct Site {
     pub connect: Vec<String>,
     /// Endpoints that others may connect to, such as a trainer. Servers that are started here have one of their own.
     pub listen: Vec<String>,
-    /// Who meets whom.
+    /// Namespace: peers see each other only within the same fleet.
     pub fleet: String,
-    /// Sessions without requests end after that, on servers started here; none takes the servers' own limit.
-    pub idle_secs: Option<u32>,
     /// A Python that has the packages already, instead of the one that is set up.
     pub python: Option<PathBuf>,
 }
 
+/// An open network, and the servers that were started for it.
+pub struct Deployment {
+    /// The way to all servers.
+    pub network: Network,
+    /// Those of this machine.
+    pub local: Option<Arc<LocalServers>>,
+}
+
+impl Deployment {
+    /// Ends the local servers, then the network. Blocks.
+    pub fn close(self, runtime: &Runtime) -> Result<()> {
+        // Servers first: they would report the network's end as an error.
+        drop(self.local);
+        runtime.block_on(self.network.close())
+    }
+}
+
 impl Site {
-    /// Opens the network, starts the local servers if there are any, works, and ends both. Blocks.
-    pub fn run<T>(
-        &self,
-        runtime: &Runtime,
-        sessions: usize,
-        work: impl AsyncFnOnce(&Network, Option<&LocalServers>) -> Result<T>,
-    ) -> Result<T> {
+    /// Opens the network and starts the local servers if there are any. Blocks; the first time takes minutes.
+    pub fn open(&self, runtime: &Runtime, sessions: usize) -> Result<Deployment> {
         let program = if self.servers > 0 { Some(self.program()?) } else { None };
         let network = runtime.block_on(Network::open(self.network_options()))?;
         let local = program.map(|program| self.start(program, &network, sessions)).transpose()?;
-        let result = runtime.block_on(work(&network, local.as_ref()));
-        // Servers first: they would report the network's end as an error.
-        drop(local);
-        runtime.block_on(network.close())?;
-        result
+        Ok(Deployment { network, local: local.map(Arc::new) })
     }
 
     /// What local servers are started with; the first time takes minutes.
@@ -91,7 +98,6 @@ impl Site {
             fleet: self.fleet.clone(),
             // Each could serve all of them, should the others die.
             sessions_each: sessions,
-            idle_secs: self.idle_secs,
         };
         LocalServers::start(program, &options)
     }

@@ -1,218 +1,221 @@
-//! Rollouts: many episodes at once in lockstep, one pass of the network per control step for all of them.
+//! Rollouts: many episodes at once, each at its own pace, with one policy that decides for whatever episodes are ready.
 //!
-//! Arms may share a batch, for what a request gets from the policy does not depend on the requests beside it. An episode
-//! that breaks is dropped alone, noted as a fault, and run again on another session; only an episode that ran to its end
-//! is recorded.
+//! ```text
+//! EpisodeQueue ─lease─▶ worker ─▶ SessionPool ─▶ Environment::reset ─▶ Episode ─┐
+//!                         │  ┌──────────── observation ◀────────────────────────┤
+//!                         │  └▶ DecisionBatcher (Decider) ─▶ actions ─▶ step ───┘
+//!                         └─▶ EpisodeRecord ─▶ event sinks
+//! ```
+//!
+//! Settings may share a batch, for a decision does not depend on the episodes beside it. An episode that breaks is dropped
+//! alone, noted as a fault and run again; only an episode that ran to its end is recorded.
 
-mod attempt;
-mod crew;
-mod journal;
-mod queue;
+mod batcher;
+mod episode;
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::{Context, Result};
-use protocol::{Reset, Transition, VerifierUpdate};
-use tokio::sync::watch;
-use tokio::task::{JoinSet, block_in_place};
+use decision::{Decider, Scorer};
+use store::queue::{Disposition, EpisodeQueue, Lease};
+use store::record::Versions;
+use store::run::FaultRecord;
+use tokio::sync::{Notify, watch};
+use tokio::task::JoinSet;
 
-pub use attempt::{Keep, Scene, Seat, candidate_action, score};
-pub use crew::Crew;
-pub use journal::Journal;
-pub use queue::{ATTEMPTS_MAX, Job, Queue};
-
-use attempt::Attempt;
-
-use vla::Vla;
-
-use decision::{Proposal, ProposalRequest};
-use store::record::EpisodeIdentity;
+use crate::fault::AttemptFault;
+use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
+use crate::sinks::{Event, Sinks};
 use crate::stop::Stop;
-use verifier::Verifier;
-use crate::wire::EnvironmentFault;
+use batcher::DecisionBatcher;
+use episode::EpisodeRun;
+
+/// What a candidate's record keeps.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RecordOptions {
+    /// The hidden states of all candidates instead of the chosen one's.
+    pub all_hidden: bool,
+    /// A video of every episode.
+    pub video: bool,
+}
 
 /// Everything that a rollout uses.
-pub struct Rollout<'a> {
-    /// Proposes.
-    pub policy: &'a Policy,
-    /// Scores, when there is one; followed between episodes.
-    pub verifier: Option<Arc<Verifier>>,
-    /// Newer verifiers.
-    pub updates: Option<watch::Receiver<Option<Arc<VerifierUpdate>>>>,
+pub struct Rollout<P> {
+    /// Decides.
+    pub decider: Arc<Decider>,
+    /// The newest scorer; an episode keeps the one that it began with.
+    pub scorer: watch::Receiver<Option<Arc<dyn Scorer>>>,
     /// Opens sessions.
-    pub crew: Crew<'a>,
+    pub pool: P,
     /// What is to be run.
-    pub queue: Queue,
-    /// Where it goes.
-    pub journal: Journal,
+    pub queue: Arc<dyn EpisodeQueue>,
+    /// Where events go.
+    pub sinks: Sinks,
     /// Episodes at once.
     pub sessions: usize,
-    /// What records hold beside the necessary.
-    pub keep: Keep,
+    /// What records hold.
+    pub options: RecordOptions,
+    /// What records say they were made with; simulator, policy and verifier are filled in.
+    pub versions: Versions,
     /// Asked between episodes.
     pub stop: watch::Receiver<Stop>,
 }
 
-/// A step as it comes back from a server.
-type Stepped = (Attempt, Result<Transition, EnvironmentFault>, f32);
-
-impl Rollout<'_> {
-    /// Runs the queue to its end, or until it is stopped. Afterwards queue and journal tell what came of it.
-    pub async fn run(&mut self) -> Result<()> {
+impl<P: SessionPool> Rollout<P> {
+    /// Runs the queue to its end, or until it is stopped. What was recorded is durable when this returns.
+    pub async fn run(self) -> Result<()> {
         let mut stop = self.stop.clone();
-        tokio::select! {
-            result = self.work() => result,
+        let sessions = self.sessions;
+        let active = Arc::new(AtomicUsize::new(0));
+        let batcher = DecisionBatcher::start(Arc::clone(&self.decider), Arc::clone(&active));
+        let shared = Arc::new(Shared {
+            rollout: self,
+            batcher,
+            active,
+            leased: AtomicUsize::new(0),
+            returned: Notify::new(),
+        });
+        let mut workers = JoinSet::new();
+        for _ in 0..sessions {
+            let shared = Arc::clone(&shared);
+            workers.spawn(async move { shared.work().await });
+        }
+        let finished = async {
+            while let Some(worker) = workers.join_next().await {
+                worker.context("an episode's worker panicked")??;
+            }
+            Ok(())
+        };
+        let result = tokio::select! {
+            result = finished => result,
             // An error says that nobody can stop it any more, so it is no reason to stop.
             Ok(_) = stop.wait_for(|stop| *stop == Stop::Now) => Ok(()),
+        };
+        workers.shutdown().await;
+        let shared = Arc::into_inner(shared).context("a worker outlived the rollout")?;
+        // Why the run ended matters more than what the sinks say about it.
+        result.and(shared.rollout.sinks.finish().await)
+    }
+}
+
+/// What the workers share.
+struct Shared<P> {
+    rollout: Rollout<P>,
+    batcher: DecisionBatcher,
+    /// Episodes between reset and end.
+    active: Arc<AtomicUsize>,
+    /// Leases that workers hold.
+    leased: AtomicUsize,
+    /// A lease was completed, failed or released.
+    returned: Notify,
+}
+
+impl<P: SessionPool> Shared<P> {
+    async fn work(&self) -> Result<()> {
+        while let Some(lease) = self.next_lease().await? {
+            let result = self.run_lease(lease).await;
+            self.leased.fetch_sub(1, Ordering::AcqRel);
+            self.returned.notify_waiters();
+            result?;
         }
+        Ok(())
     }
 
-    async fn work(&mut self) -> Result<()> {
-        let mut attempts = Vec::new();
+    /// The next episode; none when there is none left or the run is to end.
+    async fn next_lease(&self) -> Result<Option<Lease>> {
         loop {
-            self.fill(&mut attempts).await?;
-            if attempts.is_empty() {
-                // Resets may all have broken; what is to be run again waits in the queue.
-                if self.queue.is_empty() || *self.stop.borrow() != Stop::No {
-                    return Ok(());
-                }
-                continue;
+            let returned = self.returned.notified();
+            if *self.rollout.stop.borrow() != Stop::No {
+                return Ok(None);
             }
-            let begun = Instant::now();
-            let proposals = self.propose(&attempts)?;
-            let logits = self.score(&mut attempts, &proposals);
-            let actions = self.choose(&mut attempts, proposals, logits);
-            let decision_ms = milliseconds_since(begun);
-            attempts = self.step(attempts, actions, decision_ms).await?;
-        }
-    }
-
-    /// Begins planned episodes on the free sessions, all resets at once.
-    async fn fill(&mut self, attempts: &mut Vec<Attempt>) -> Result<()> {
-        self.follow_verifier();
-        let mut resets = JoinSet::new();
-        while attempts.len() + resets.len() < self.sessions && *self.stop.borrow() == Stop::No {
-            let Some(job) = self.queue.take() else { break };
-            let is_alone = attempts.is_empty() && resets.is_empty();
-            let Some((seat, environment)) = self.crew.seat(&job, is_alone).await? else {
-                self.queue.put_back(job);
-                break;
-            };
-            let reset = reset(&job.identity);
-            resets.spawn(async move { (job, seat, environment.reset(reset).await) });
-        }
-        while let Some(joined) = resets.join_next().await {
-            let (job, seat, result) = joined.context("a reset panicked")?;
-            match result {
-                Ok(episode) => {
-                    let verifier = self.verifier.clone();
-                    attempts.push(Attempt::new(job, seat, episode, verifier, self.keep)?);
-                }
-                Err(fault) => self.broke(job, &seat, &fault)?,
+            self.leased.fetch_add(1, Ordering::AcqRel);
+            if let Some(lease) = self.rollout.queue.lease().await? {
+                return Ok(Some(lease));
             }
+            // What others hold may fail and come back.
+            if self.leased.fetch_sub(1, Ordering::AcqRel) == 1 {
+                self.returned.notify_waiters();
+                return Ok(None);
+            }
+            returned.await;
         }
-        Ok(())
     }
 
-    fn propose(&self, attempts: &[Attempt]) -> Result<Vec<Proposal>> {
-        let requests: Vec<ProposalRequest<'_>> = attempts.iter().map(Attempt::request).collect();
-        // The network computes on all cores; the runtime's other tasks go on meanwhile.
-        block_in_place(|| self.policy.propose(&requests))
+    async fn run_lease(&self, lease: Lease) -> Result<()> {
+        let Rollout { pool, queue, sinks, .. } = &self.rollout;
+        let request = SessionRequest {
+            task: lease.job.identity.task_id(),
+            needs_expert: lease.job.setting.strategy.needs_expert(),
+        };
+        let mut stop = self.rollout.stop.clone();
+        let session = tokio::select! {
+            session = pool.acquire(&request) => session?,
+            Ok(_) = stop.wait_for(|stop| *stop != Stop::No) => return queue.release(lease).await,
+        };
+        let info = session.info.clone();
+        match self.attempt(&lease, session).await {
+            Ok((record, environment)) => {
+                sinks.record(record).await?;
+                pool.release(Session { info, environment });
+                queue.complete(lease).await
+            }
+            Err(fault) => self.note_fault(lease, &info, fault).await,
+        }
     }
 
-    fn score(&self, attempts: &mut [Attempt], proposals: &[Proposal]) -> Vec<Option<Vec<f32>>> {
-        let decisions = attempts.iter_mut().zip(proposals);
-        decisions.map(|(attempt, proposal)| attempt.score(proposal, self.policy)).collect()
-    }
-
-    fn choose(
+    async fn attempt(
         &self,
-        attempts: &mut [Attempt],
-        proposals: Vec<Proposal>,
-        logits: Vec<Option<Vec<f32>>>,
-    ) -> Vec<[f32; 7]> {
-        let scale = self.policy.action_scale();
-        let decisions = attempts.iter_mut().zip(proposals).zip(logits);
-        let choose =
-            |((attempt, proposal), logits): ((&mut Attempt, Proposal), Option<Vec<f32>>)| {
-                attempt.choose(proposal, logits, &scale, self.keep)
-            };
-        decisions.map(choose).collect()
+        lease: &Lease,
+        session: Session<P::Environment>,
+    ) -> Result<(store::record::EpisodeRecord, P::Environment), AttemptFault> {
+        let run = EpisodeRun {
+            lease,
+            options: self.rollout.options,
+            versions: &self.rollout.versions,
+            policy: self.rollout.decider.policy().info(),
+            scorer: self.rollout.scorer.borrow().clone(),
+            batcher: &self.batcher,
+            sinks: &self.rollout.sinks,
+            pool: &self.rollout.pool,
+        };
+        let _active = Active::one_more(&self.active);
+        run.run(session).await
     }
 
-    /// Steps all episodes at once; gives back those that go on.
-    async fn step(
-        &mut self,
-        attempts: Vec<Attempt>,
-        actions: Vec<[f32; 7]>,
-        decision_ms: f32,
-    ) -> Result<Vec<Attempt>> {
-        let mut steps: JoinSet<Stepped> = JoinSet::new();
-        for (mut attempt, action) in attempts.into_iter().zip(actions) {
-            steps.spawn(async move {
-                let begun = Instant::now();
-                let result = attempt.episode.step(action).await;
-                (attempt, result, milliseconds_since(begun))
-            });
+    async fn note_fault(&self, lease: Lease, info: &SessionInfo, fault: AttemptFault) -> Result<()> {
+        let record = FaultRecord {
+            identity: lease.job.identity.clone(),
+            attempt: lease.job.attempt,
+            server: info.server.clone(),
+            reason: fault.to_string(),
+        };
+        let id = record.identity.id();
+        self.rollout.sinks.emit(Event::Faulted(record)).await?;
+        let disposition = self.rollout.queue.fail(lease, fault.scope(), &fault.to_string()).await?;
+        if disposition == Disposition::GivenUp {
+            let notice = format!("{id} is given up: {fault}");
+            self.rollout.sinks.emit(Event::Notice(notice)).await?;
         }
-        self.journal.progress.stepped(steps.len());
-        let mut going_on = Vec::new();
-        while let Some(joined) = steps.join_next().await {
-            let (mut attempt, result, step_ms) = joined.context("a step panicked")?;
-            match result {
-                Ok(transition) if attempt.observe(&transition, decision_ms, step_ms)? => {
-                    self.finish(attempt).await?;
-                }
-                Ok(_) => going_on.push(attempt),
-                Err(fault) => self.broke(attempt.job, &attempt.seat, &fault)?,
-            }
-        }
-        Ok(going_on)
-    }
-
-    async fn finish(&mut self, attempt: Attempt) -> Result<()> {
-        let finished = attempt.finish(self.policy.digest())?;
-        self.journal.record(&finished.record, finished.video.as_deref()).await?;
-        self.crew.free(finished.seat, finished.episode.finish());
         Ok(())
     }
+}
 
-    fn broke(&mut self, job: Job, seat: &Seat, fault: &EnvironmentFault) -> Result<()> {
-        self.crew.lost(seat, fault);
-        self.journal.fault(&job, &seat.server, fault)?;
-        self.queue.broke(job);
-        Ok(())
-    }
+/// Counts an episode as running until it is dropped.
+struct Active<'a>(&'a AtomicUsize);
 
-    /// Takes up a newer verifier, if there is one; episodes that run keep theirs.
-    fn follow_verifier(&mut self) {
-        let Some(updates) = &mut self.updates else { return };
-        // An error says that no more can come.
-        if !updates.has_changed().unwrap_or(false) {
-            return;
-        }
-        let Some(update) = updates.borrow_and_update().clone() else { return };
-        match Verifier::from_bytes(&update.weights, self.policy.digest()) {
-            Ok(verifier) => {
-                let digest = verifier.digest().get(..12).unwrap_or_default();
-                self.journal.progress.say(&format!("verifier {} is now {digest}", update.name));
-                self.verifier = Some(Arc::new(verifier));
-            }
-            Err(error) => tracing::warn!("the verifier {} is ignored: {error:#}", update.name),
-        }
+impl<'a> Active<'a> {
+    fn one_more(count: &'a AtomicUsize) -> Active<'a> {
+        count.fetch_add(1, Ordering::AcqRel);
+        Active(count)
     }
 }
 
-fn reset(identity: &EpisodeIdentity) -> Reset {
-    Reset {
-        task: identity.task.clone(),
-        variant: identity.variant.clone(),
-        layout: identity.layout,
-        seed: identity.seed,
+impl Drop for Active<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::AcqRel);
     }
 }
 
-fn milliseconds_since(begun: Instant) -> f32 {
-    begun.elapsed().as_secs_f32() * 1000.0
-}
+#[cfg(test)]
+mod tests;

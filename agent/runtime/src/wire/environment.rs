@@ -11,8 +11,10 @@ use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::{CongestionControl, Reliability};
 
-use super::servers::Sign;
-use super::{EnvironmentFault, Episode, Network, Timing};
+use super::discovery::ServerStatus;
+use super::{Episode, Network, Timing};
+use crate::fault::EnvironmentFault;
+use crate::session;
 
 /// Replies that may wait to be read: one that is awaited and late copies of it. More are dropped, for
 /// the server sends again what is asked again.
@@ -25,14 +27,16 @@ pub struct Environment {
     session: String,
     image_height: usize,
     image_width: usize,
+    has_expert: bool,
     timing: Timing,
+    network: Network,
     /// Of the last request that was sent.
     sequence: u64,
     /// The last request as it was sent.
     request: ZBytes,
     /// Times that the server's token had gone when the session was opened.
     losses: u32,
-    signs: watch::Receiver<Sign>,
+    status: watch::Receiver<ServerStatus>,
     replies: mpsc::Receiver<ZBytes>,
     /// Of the last reply that was awaited.
     pub(super) reply_bytes: usize,
@@ -48,8 +52,8 @@ impl Environment {
         server: &str,
         open: Open,
     ) -> Result<Self, EnvironmentFault> {
-        let signs = network.servers.signs(server);
-        let losses = signs.borrow().losses;
+        let status = network.discovery.status(server);
+        let losses = status.borrow().losses;
         let session = ask_for_session(network, server, &open).await?;
         let (sender, replies) = mpsc::channel(REPLIES_MAX);
         let keys = &network.keys;
@@ -82,11 +86,13 @@ impl Environment {
             session,
             image_height: open.image_height as usize,
             image_width: open.image_width as usize,
+            has_expert: open.expert,
             timing: network.timing,
+            network: network.clone(),
             sequence: 0,
             request: ZBytes::new(),
             losses,
-            signs,
+            status,
             replies,
             reply_bytes: 0,
             publisher,
@@ -103,6 +109,11 @@ impl Environment {
     /// The session's id.
     pub fn session(&self) -> &str {
         &self.session
+    }
+
+    /// Whether observations carry the scripted expert's action.
+    pub fn has_expert(&self) -> bool {
+        self.has_expert
     }
 
     /// Starts an episode. An error gives the session up: open another one.
@@ -142,8 +153,25 @@ impl Environment {
         let sequence = self.sequence + 1;
         let bytes = encode(&request(sequence)).map_err(|error| EnvironmentFault::unsent(&error))?;
         self.request = ZBytes::from(bytes);
+        self.refuse_early_replies(sequence)?;
         self.sequence = sequence;
         self.ask_again(asked).await
+    }
+
+    /// Empties the channel before a request goes out: what waits there are late copies of earlier replies. A reply to
+    /// the request that is about to be sent was made by somebody who had not read it.
+    fn refuse_early_replies(&mut self, sequence: u64) -> Result<(), EnvironmentFault> {
+        while let Ok(payload) = self.replies.try_recv() {
+            let reply: Reply = read(&payload)?;
+            if reply.sequence() >= sequence {
+                return Err(EnvironmentFault::wire(format!(
+                    "expected request {sequence} to come before its reply, got {} for request {} first",
+                    reply.kind(),
+                    reply.sequence()
+                )));
+            }
+        }
+        Ok(())
     }
 
     /// Sends the last request once more, until its reply comes. A server that has answered it before gives the same
@@ -155,13 +183,13 @@ impl Environment {
         let asked_at = Instant::now();
         let mut resend = self.timing.resend;
         loop {
-            self.check_server(asked, asked_at)?;
+            self.check_server(asked, asked_at).await?;
             self.publisher.put(self.request.clone()).await.map_err(EnvironmentFault::wire)?;
             if let Some(reply) = self.reply_within(resend, asked, asked_at).await? {
                 return match reply {
-                    Reply::Refused { reason, .. } => Err(EnvironmentFault::Refused { reason }),
+                    Reply::Refused { reason, .. } => Err(EnvironmentFault::refused(&reason)),
                     Reply::Faulted { kind, reason, .. } => {
-                        Err(EnvironmentFault::Faulted { kind, reason })
+                        Err(EnvironmentFault::faulted(kind, &reason))
                     }
                     reply => Ok(reply),
                 };
@@ -183,34 +211,32 @@ impl Environment {
                 biased;
                 payload = self.replies.recv() => {
                     let payload = payload.ok_or_else(|| EnvironmentFault::wire("the network is closed"))?;
-                    protocol::codec::check_size::<Reply>(payload.len()).map_err(EnvironmentFault::wire)?;
-                    let bytes = Bytes::from(payload.to_bytes().into_owned());
-                    let reply: Reply = decode_shared(&bytes).map_err(EnvironmentFault::wire)?;
+                    let reply = read(&payload)?;
                     // Number 0 is about the session itself, or about a request that could not be read.
                     if reply.sequence() == self.sequence || reply.sequence() == 0 {
-                        self.reply_bytes = bytes.len();
+                        self.reply_bytes = payload.len();
                         return Ok(Some(reply));
                     }
                 }
                 // An error here would mean that the network is gone; the next reply tells.
-                Ok(()) = self.signs.changed() => self.check_server(asked, asked_at)?,
+                Ok(()) = self.status.changed() => self.check_server(asked, asked_at).await?,
                 () = tokio::time::sleep_until(deadline) => return Ok(None),
             }
         }
     }
 
-    fn check_server(
+    async fn check_server(
         &mut self,
         asked: &'static str,
         asked_at: Instant,
     ) -> Result<(), EnvironmentFault> {
-        let sign = *self.signs.borrow_and_update();
-        if sign.losses != self.losses {
-            return Err(EnvironmentFault::ServerLost { server: self.server.clone() });
+        let status = *self.status.borrow_and_update();
+        if status.losses != self.losses {
+            self.await_return().await?;
         }
         let waited = asked_at.elapsed();
-        // A server beats from its start on, but its first beat may not have come when a request goes out.
-        let silent = sign.beaten_at.map_or(waited, |beaten_at| beaten_at.elapsed().min(waited));
+        // Heartbeats start with the server; the first may arrive after our first request.
+        let silent = status.beaten_at.map_or(waited, |beaten_at| beaten_at.elapsed().min(waited));
         if silent > self.timing.silence_max || waited > self.timing.reply_max {
             let waited_secs = waited.as_secs();
             return Err(EnvironmentFault::TimedOut {
@@ -221,6 +247,31 @@ impl Environment {
         }
         Ok(())
     }
+}
+
+impl Environment {
+    /// A token that has gone may come back: the link may have failed and not the server. One that comes back within the
+    /// time for which a server keeps a session costs nothing but that time.
+    async fn await_return(&mut self) -> Result<(), EnvironmentFault> {
+        let server = self.server.clone();
+        if !self.network.is_remote() || self.network.is_connected().await {
+            return Err(EnvironmentFault::ServerLost { server });
+        }
+        let returned = self.status.wait_for(|status| status.alive);
+        match tokio::time::timeout(self.timing.link_max, returned).await {
+            Ok(Ok(status)) => self.losses = status.losses,
+            Ok(Err(_)) => return Err(EnvironmentFault::wire("the network is closed")),
+            Err(_) => return Err(EnvironmentFault::LinkLost { server }),
+        }
+        Ok(())
+    }
+}
+
+/// Reads a reply of a size that the protocol allows.
+fn read(payload: &ZBytes) -> Result<Reply, EnvironmentFault> {
+    protocol::codec::check_size::<Reply>(payload.len()).map_err(EnvironmentFault::wire)?;
+    let bytes = Bytes::from(payload.to_bytes().into_owned());
+    decode_shared(&bytes).map_err(EnvironmentFault::wire)
 }
 
 /// For a reply that does not belong to its request.
@@ -236,9 +287,9 @@ async fn ask_for_session(
     let asked_at = Instant::now();
     let payload = encode(open).map_err(|error| EnvironmentFault::unsent(&error))?;
     let key = network.keys.open(server).map_err(EnvironmentFault::wire)?;
-    let mut signs = network.servers.signs(server);
-    let losses = signs.borrow().losses;
-    let lost = signs.wait_for(|sign| sign.losses != losses);
+    let mut status = network.discovery.status(server);
+    let losses = status.borrow().losses;
+    let lost = status.wait_for(|status| status.losses != losses);
     let replies = network
         .session
         .get(key)
@@ -263,6 +314,14 @@ async fn ask_for_session(
         .map_err(EnvironmentFault::wire)?;
     match decode(&sample.payload().to_bytes()).map_err(EnvironmentFault::wire)? {
         Opening::Opened { session } => Ok(session),
-        Opening::Refused { reason } => Err(EnvironmentFault::Refused { reason }),
+        Opening::Refused { reason } => Err(EnvironmentFault::refused(&reason)),
+    }
+}
+
+impl session::Environment for Environment {
+    type Episode = Episode;
+
+    async fn reset(self, reset: Reset) -> Result<Episode, EnvironmentFault> {
+        Environment::reset(self, reset).await
     }
 }

@@ -6,20 +6,15 @@ use std::time::Duration;
 use protocol::{Observation, Reply, Request, Transition};
 
 use super::environment::unexpected;
-use super::{Environment, EnvironmentFault};
-
-/// Numbers of a Bridge state: x y z (m) roll pitch yaw (rad) in the base's frame, pad, gripper opening.
-pub const STATE_LENGTH: usize = 8;
-/// Numbers of a Bridge action: translation (m), rotation vector (rad), gripper +1 open or -1 closed.
-pub const ACTION_LENGTH: usize = 7;
+use super::Environment;
+use crate::fault::EnvironmentFault;
+use crate::session;
 
 /// Owns its environment until [`Episode::finish`]. After any fault but `Refused` it is void: drop it.
 #[derive(Debug)]
 pub struct Episode {
     environment: Environment,
     observation: Observation,
-    state: [f32; STATE_LENGTH],
-    expert_action: Option<[f32; ACTION_LENGTH]>,
     simulator_time: Duration,
 }
 
@@ -29,23 +24,12 @@ impl Episode {
         observation: Observation,
     ) -> Result<Self, EnvironmentFault> {
         environment.check_image(&observation.image)?;
-        let (state, expert_action) = numbers(&observation)?;
-        Ok(Self { environment, observation, state, expert_action, simulator_time: Duration::ZERO })
+        Ok(Self { environment, observation, simulator_time: Duration::ZERO })
     }
 
     /// What the policy sees now.
     pub fn observation(&self) -> &Observation {
         &self.observation
-    }
-
-    /// Its state.
-    pub fn state(&self) -> [f32; STATE_LENGTH] {
-        self.state
-    }
-
-    /// The scripted expert's action here, where the session was opened for it.
-    pub fn expert_action(&self) -> Option<[f32; ACTION_LENGTH]> {
-        self.expert_action
     }
 
     /// The server's id.
@@ -56,7 +40,7 @@ impl Episode {
     /// One control step.
     pub async fn step(
         &mut self,
-        action: [f32; ACTION_LENGTH],
+        action: &[f32],
     ) -> Result<Transition, EnvironmentFault> {
         let request = |sequence| Request::Step { sequence, action: action.to_vec() };
         match self.environment.ask("Step", request).await? {
@@ -116,23 +100,27 @@ impl Episode {
 
     fn observe(&mut self, observation: Observation) -> Result<(), EnvironmentFault> {
         self.environment.check_image(&observation.image)?;
-        (self.state, self.expert_action) = numbers(&observation)?;
         self.observation = observation;
         Ok(())
     }
 }
 
-type Numbers = ([f32; STATE_LENGTH], Option<[f32; ACTION_LENGTH]>);
+impl session::Episode for Episode {
+    type Environment = Environment;
 
-/// State and expert's action, of the lengths that policies and verifiers are made for.
-fn numbers(observation: &Observation) -> Result<Numbers, EnvironmentFault> {
-    let expert_action = observation.expert_action.as_deref();
-    let expert_action = expert_action.map(|action| array("an expert's action", action));
-    Ok((array("a state", &observation.state)?, expert_action.transpose()?))
-}
+    fn observation(&self) -> &Observation {
+        Episode::observation(self)
+    }
 
-fn array<const N: usize>(what: &str, values: &[f32]) -> Result<[f32; N], EnvironmentFault> {
-    values.try_into().map_err(|_| {
-        EnvironmentFault::wire(format!("expected {what} of {N} numbers, got {}", values.len()))
-    })
+    async fn step(&mut self, action: &[f32]) -> Result<Transition, EnvironmentFault> {
+        Episode::step(self, action).await
+    }
+
+    fn simulator_time(&self) -> Duration {
+        Episode::simulator_time(self)
+    }
+
+    fn finish(self) -> Environment {
+        Episode::finish(self)
+    }
 }

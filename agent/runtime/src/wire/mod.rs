@@ -1,23 +1,24 @@
 //! The agent's end of the protocol: the only place that imports zenoh.
 //!
-//! [`Network`] finds servers, [`Environment`] leases a session of one and [`Episode`] is the only
-//! thing that can step it. [`OutcomePublisher`] and [`OutcomeSubscriber`] carry what became of
-//! episodes, [`VerifierPublisher`] and [`VerifierSubscriber`] carry newly trained verifiers.
+//! [`Network`] finds servers in the background, [`ZenohPool`] opens sessions where there is room, [`Environment`] leases
+//! one and [`Episode`] is the only thing that can step it. [`OutcomePublisher`] tells observers what came of episodes,
+//! [`VerifierPublisher`] and [`VerifierSubscriber`] carry newly trained verifiers.
 
+mod discovery;
 mod environment;
 mod episode;
-mod fault;
 mod network;
 mod outcomes;
+mod pool;
 mod probe;
-mod servers;
 mod verifier_updates;
 
+pub use discovery::Fleet;
 pub use environment::Environment;
-pub use episode::{ACTION_LENGTH, Episode, STATE_LENGTH};
-pub use fault::EnvironmentFault;
+pub use episode::Episode;
 pub use network::{Network, NetworkOptions, Timing};
-pub use outcomes::{OutcomePublisher, OutcomeSubscriber};
+pub use outcomes::OutcomePublisher;
+pub use pool::{PoolOptions, ZenohPool};
 pub use probe::Probe;
 pub use protocol::Description as ServerDescription;
 pub use protocol::Reset;

@@ -6,11 +6,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use protocol::{Description, Keys, transport};
+use protocol::{Keys, transport};
 use tempfile::TempDir;
 use zenoh::Session;
 
-use super::servers::Servers;
+use super::discovery::{Discovery, Fleet};
 
 /// Stands for a free port of this machine alone.
 const ANY_LOOPBACK_PORT: &str = "tcp/127.0.0.1:0";
@@ -31,7 +31,7 @@ pub struct NetworkOptions {
     pub listen_here: bool,
     /// Endpoints that others may connect to; `tcp/127.0.0.1:0` takes a free port.
     pub listen: Vec<String>,
-    /// Who meets whom.
+    /// Namespace: peers see each other only within the same fleet.
     pub fleet: String,
     /// Find others on the local network by multicast; without `listen`, listens on every interface.
     pub multicast: bool,
@@ -52,6 +52,8 @@ pub struct Timing {
     pub reply_max: Duration,
     /// A session is opened within this time; the server may have to load a model first.
     pub open_max: Duration,
+    /// A link that comes back within this time costs no episode: servers keep a session for as long.
+    pub link_max: Duration,
 }
 
 /// A handle to one zenoh session; clones share it.
@@ -59,9 +61,10 @@ pub struct Timing {
 pub struct Network {
     pub(super) session: Session,
     pub(super) keys: Keys,
-    pub(super) servers: Arc<Servers>,
+    pub(super) discovery: Arc<Discovery>,
     pub(super) timing: Timing,
     listening: Vec<String>,
+    is_remote: bool,
     /// Holds the socket; goes with the last clone.
     _folder: Option<Arc<TempDir>>,
 }
@@ -88,6 +91,7 @@ impl Default for Timing {
             silence_max: Duration::from_secs(15),
             reply_max: Duration::from_secs(120),
             open_max: Duration::from_secs(60),
+            link_max: Duration::from_secs(10),
         }
     }
 }
@@ -100,14 +104,15 @@ impl Network {
         let (here, folder) = here.unzip();
         let listen: Vec<String> = here.into_iter().chain(options.listen.clone()).collect();
         let (session, listening) = open_session(&options, &listen).await?;
-        let servers = Servers::watch(&session, &keys).await?;
+        let discovery = Discovery::watch(&session, &keys).await?;
         let timing = options.timing;
         Ok(Self {
             session,
             keys,
-            servers,
+            discovery,
             timing,
             listening,
+            is_remote: !options.connect.is_empty(),
             _folder: folder.flatten().map(Arc::new),
         })
     }
@@ -117,13 +122,32 @@ impl Network {
         &self.listening
     }
 
-    /// Waits until `count` servers live and have described themselves, or until `wait` is over.
-    /// Returns all that have, in the order of their ids.
-    pub async fn servers(&self, count: usize, wait: Duration) -> Vec<Description> {
-        self.servers.described(&self.session, &self.keys, count, wait).await
+    /// The servers that are alive, from now on.
+    pub fn fleet(&self) -> tokio::sync::watch::Receiver<Fleet> {
+        self.discovery.fleet()
     }
 
-    /// Ends the session; whoever watches this agent's tokens sees it at once.
+    /// Waits until `count` servers have described themselves, or until `wait` is over; what is known then.
+    pub async fn servers(&self, count: usize, wait: Duration) -> Fleet {
+        let mut fleet = self.fleet();
+        let is_complete = |fleet: &Fleet| fleet.servers.len() >= count;
+        // Neither the time's end nor the network's is an error here: the caller sees who is there.
+        let _ = tokio::time::timeout(wait, fleet.wait_for(is_complete)).await;
+        fleet.borrow().clone()
+    }
+
+    /// Whether servers are reached over a link of their own, which may fail without them.
+    pub(super) fn is_remote(&self) -> bool {
+        self.is_remote
+    }
+
+    /// Whether anything is connected: without a router or a server at the other end, silence says nothing about servers.
+    pub async fn is_connected(&self) -> bool {
+        let info = self.session.info();
+        info.routers_zid().await.next().is_some() || info.peers_zid().await.next().is_some()
+    }
+
+    /// Ends the session; peers that watch this agent's tokens see it at once.
     pub async fn close(self) -> anyhow::Result<()> {
         self.session.close().await.map_err(|error| anyhow!("cannot close the network: {error}"))
     }

@@ -96,7 +96,7 @@ impl Probe {
 impl Network {
     /// Asks one server what it is.
     pub async fn describe(&self, server: &str) -> Result<Description> {
-        super::servers::describe(self.session.clone(), self.keys.clone(), server.to_owned()).await
+        super::discovery::describe(self.session.clone(), self.keys.clone(), server.to_owned()).await
     }
 
     /// The heartbeats that a server sends within `wait`.

@@ -3,8 +3,11 @@
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
+use anyhow::Result;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use tokio::sync::watch;
+
+use super::{Event, EventSink};
 
 /// How often a plain line is printed where there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
@@ -61,20 +64,19 @@ impl Progress {
         }
     }
 
-    /// For whoever measures how fast it goes.
+    /// Counters for throughput measurement.
     pub fn counts(&self) -> watch::Receiver<Counts> {
         self.counts.subscribe()
     }
 
-    /// One control step of `running` episodes is over.
-    pub fn stepped(&mut self, running: usize) {
-        self.running = running;
-        self.counts.send_modify(|counts| counts.steps += running as u64);
+    /// One control step of one episode is over.
+    fn stepped(&mut self) {
+        self.counts.send_modify(|counts| counts.steps += 1);
         self.show();
     }
 
     /// An episode of so many steps is recorded.
-    pub fn recorded(&mut self, is_success: bool, steps: usize) {
+    fn recorded(&mut self, is_success: bool, steps: usize) {
         self.done += 1;
         self.counts.send_modify(|counts| counts.episodes += 1);
         self.steps_recorded += steps as u64;
@@ -83,13 +85,13 @@ impl Progress {
     }
 
     /// An attempt broke.
-    pub fn faulted(&mut self, reason: &str) {
+    fn faulted(&mut self, reason: &str) {
         self.faults += 1;
         self.say(&format!("fault: {reason}"));
     }
 
     /// Prints a line without breaking the bar.
-    pub fn say(&self, line: &str) {
+    fn say(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| eprintln!("{line}")),
             None => eprintln!("{line}"),
@@ -97,7 +99,7 @@ impl Progress {
     }
 
     /// Leaves the last state on the screen.
-    pub fn finish(&self) {
+    fn leave(&self) {
         let line = self.line(self.started.elapsed());
         match &self.bar {
             Some(bar) => bar.abandon_with_message(line),
@@ -127,7 +129,7 @@ impl Progress {
         if self.faults > 0 {
             parts.push(format!("{} faults", self.faults));
         }
-        // Counted in steps: episodes of a batch end together, so that their own rate comes in waves.
+        // Counted in steps: episodes that began together end together, so their own rate comes in waves.
         if here > 0 && self.done < self.total {
             let steps_expected =
                 (self.total - self.done) as f64 * self.steps_recorded as f64 / here as f64;
@@ -140,6 +142,31 @@ impl Progress {
             parts.push(format!("in {}", clock(secs)));
         }
         parts.join(", ")
+    }
+}
+
+impl EventSink for Progress {
+    fn on(&mut self, event: &Event) -> Result<()> {
+        match event {
+            Event::Started { .. } => self.running += 1,
+            Event::Stepped { .. } => self.stepped(),
+            Event::Recorded(record) => {
+                self.running = self.running.saturating_sub(1);
+                self.recorded(record.statistics.is_success, record.steps.len());
+            }
+            Event::Faulted(fault) => {
+                self.running = self.running.saturating_sub(1);
+                let id = fault.identity.id();
+                self.faulted(&format!("{id} (attempt {}): {}", fault.attempt, fault.reason));
+            }
+            Event::Notice(line) => self.say(line),
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self) -> Result<()> {
+        self.leave();
+        Ok(())
     }
 }
 
@@ -166,9 +193,8 @@ mod tests {
     #[test]
     fn the_estimate_counts_only_what_this_start_has_done() {
         let mut progress = Progress::new("test", 20, 10, 5);
-        for _ in 0..10 {
-            progress.stepped(4);
-        }
+        progress.running = 4;
+        (0..40).for_each(|_| progress.stepped());
         assert_eq!(progress.line(Duration::from_secs(10)), "success 50 %, 4.0 steps/s, 4 running");
         progress.recorded(true, 10);
         progress.recorded(true, 10);

@@ -1,0 +1,281 @@
+//! One run from beginning to end: servers, rollouts, records, labels.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail, ensure};
+use decision::{Decider, Policy, Scorer, Setting, TaskId};
+use protocol::VerifierUpdate;
+use store::plan::EpisodePlan;
+use store::queue::{EpisodeQueue, GivenUp, RunQueue};
+use store::record::Versions;
+use store::run::{self, Run};
+use tokio::sync::watch;
+
+use crate::rollout::{RecordOptions, Rollout};
+use crate::sinks::{EventSink, OutcomeSink, Progress, Sinks, StoreSink, VideoSink};
+use crate::site::{Deployment, Site};
+use crate::stop::{self, Stop};
+use crate::wire::{
+    Fleet, Network, OutcomePublisher, PoolOptions, VerifierSubscriber, ZenohPool,
+};
+
+/// Discovery timeout for servers that are already running.
+const SERVERS_WAIT: Duration = Duration::from_secs(10);
+/// After some of them have been found: a fleet may have servers of other tasks, which answered first.
+const OTHERS_WAIT: Duration = Duration::from_secs(2);
+/// A run that needs a verifier and follows one waits this long for the first.
+const VERIFIER_WAIT: Duration = Duration::from_secs(60);
+/// A run that had sessions waits this long for one to come back: a router or a machine may be started again.
+const SESSION_WAIT: Duration = Duration::from_secs(600);
+/// A run that never had a session gives up earlier.
+const FIRST_SESSION_WAIT: Duration = Duration::from_secs(60);
+
+/// Makes a scorer of a published verifier, or says why it does not fit the policy.
+pub type LoadScorer = Arc<dyn Fn(&VerifierUpdate) -> Result<Arc<dyn Scorer>> + Send + Sync>;
+
+/// What to run, where, and what to keep.
+pub struct Experiment {
+    /// The command's name, in progress lines.
+    pub title: String,
+    /// Which episodes.
+    pub plans: Vec<EpisodePlan>,
+    /// How each of them is run.
+    pub settings: Vec<Setting>,
+    /// Proposes candidates.
+    pub policy: Arc<dyn Policy>,
+    /// Scores them, where there is a scorer.
+    pub scorer: Option<Arc<dyn Scorer>>,
+    /// The name of a published verifier whose newest version is taken up between episodes.
+    pub follow_verifier: Option<(String, LoadScorer)>,
+    /// Where the servers are.
+    pub site: Site,
+    /// Episodes at once.
+    pub sessions: usize,
+    /// What records hold.
+    pub record: RecordOptions,
+    /// What records say they were made with.
+    pub versions: Versions,
+}
+
+/// What became of an experiment.
+#[derive(Debug)]
+pub struct Ending {
+    /// Episodes without a record.
+    pub missing: usize,
+    /// Episodes altogether.
+    pub planned: usize,
+    /// Episodes that will not be run again, with their reasons.
+    pub given_up: Vec<GivenUp>,
+    /// Whether somebody stopped it.
+    pub was_stopped: bool,
+}
+
+impl Ending {
+    /// An error when some episode has no outcome, for a partial result must not pass for a whole one.
+    pub fn ensure_complete(&self, folder: &std::path::Path) -> Result<()> {
+        if self.missing == 0 {
+            return Ok(());
+        }
+        let why = if self.was_stopped { "stopped" } else { "faults" };
+        bail!(
+            "{why}: {} of {} episodes incomplete; rerun the same command to resume {}",
+            self.missing,
+            self.planned,
+            folder.display()
+        )
+    }
+}
+
+impl Experiment {
+    /// Runs what is not recorded yet in `run`.
+    pub fn run(&self, run: Run) -> Result<Ending> {
+        self.check()?;
+        let (folder, name) = (run.folder.clone(), run.header.run.clone());
+        let recorded = run::recorded(&folder)?;
+        let queue = RunQueue::new(&name, &self.plans, &self.settings, &recorded);
+        let queue = Arc::new(queue);
+        let runtime =
+            tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+        let mut was_stopped = false;
+        if runtime.block_on(queue.progress())?.waiting > 0 {
+            let deployment = self.site.open(&runtime, self.sessions)?;
+            let result = runtime.block_on(self.roll_out(&deployment, run, Arc::clone(&queue)));
+            let closed = deployment.close(&runtime);
+            was_stopped = result.with_context(|| {
+                format!("rerun the same command to resume {}", folder.display())
+            })?;
+            closed?;
+        }
+        let planned = self.plans.len() * self.settings.len();
+        let given_up = runtime.block_on(queue.given_up())?;
+        let missing = self.missing(&name, &folder)?;
+        Ok(Ending { missing, planned, given_up, was_stopped })
+    }
+
+    fn check(&self) -> Result<()> {
+        ensure!(!self.settings.is_empty(), "strategies: expected at least one, got none");
+        ensure!(self.sessions > 0, "sessions: expected at least 1, got 0");
+        let needing = self.settings.iter().find(|setting| setting.strategy.needs_verifier());
+        if let (Some(setting), None, None) = (needing, &self.scorer, &self.follow_verifier) {
+            bail!("strategy {}: expected a verifier (--verifier FILE), got none", setting.strategy);
+        }
+        Ok(())
+    }
+
+    /// The run may hold settings that this experiment did not ask for.
+    fn missing(&self, name: &str, folder: &std::path::Path) -> Result<usize> {
+        let recorded = run::recorded(folder)?;
+        let identities = store::queue::identities(name, &self.plans, &self.settings);
+        Ok(identities.filter(|identity| !recorded.contains(&identity.id())).count())
+    }
+
+    /// True when somebody stopped it.
+    async fn roll_out(
+        &self,
+        deployment: &Deployment,
+        run: Run,
+        queue: Arc<RunQueue>,
+    ) -> Result<bool> {
+        let network = &deployment.network;
+        self.check_tasks(network).await?;
+        let name = run.header.run.clone();
+        let (scorer, _following) = self.scorers(network).await?;
+        let summaries = run.summaries()?;
+        let simulator = summaries.first().map(|summary| summary.simulator.clone());
+        let successes = summaries.iter().filter(|one| one.statistics.is_success).count();
+        let waiting = queue.progress().await?.waiting;
+        let done = summaries.len() as u64;
+        let progress =
+            Progress::new(&self.title, done + waiting as u64, done, successes as u64);
+        let outcomes = OutcomePublisher::declare(network, &name).await?;
+        let mut sinks: Vec<Box<dyn EventSink>> = Vec::new();
+        if self.record.video {
+            sinks.push(Box::new(VideoSink::new(run.folder.clone())));
+        }
+        sinks.push(Box::new(StoreSink::new(run)));
+        sinks.push(Box::new(OutcomeSink::new(outcomes)));
+        sinks.push(Box::new(progress));
+        let info = self.policy.info();
+        let pool = PoolOptions {
+            image_size: info.image_size,
+            action_length: info.action_space.length(),
+            holder: name,
+            simulator,
+            first_wait: FIRST_SESSION_WAIT,
+            wait: SESSION_WAIT,
+        };
+        let stop = stop::listen()?;
+        let rollout = Rollout {
+            decider: Arc::new(Decider::new(Arc::clone(&self.policy))),
+            scorer,
+            pool: ZenohPool::new(network.clone(), deployment.local.clone(), pool),
+            queue: queue as Arc<dyn EpisodeQueue>,
+            sinks: Sinks::start(sinks)?,
+            sessions: self.sessions,
+            options: self.record,
+            versions: self.versions.clone(),
+            stop: stop.clone(),
+        };
+        rollout.run().await?;
+        Ok(*stop.borrow() != Stop::No)
+    }
+
+    /// A task that nobody offers would break every one of its episodes.
+    async fn check_tasks(&self, network: &Network) -> Result<()> {
+        let wanted: BTreeSet<&TaskId> = self.plans.iter().map(|plan| &plan.task).collect();
+        let mut fleet = network.servers(self.site.servers.max(1), SERVERS_WAIT).await;
+        if fleet.servers.is_empty() {
+            bail!("{}", self.nobody(&fleet));
+        }
+        if !wanted.is_subset(&offered(&fleet).iter().collect()) {
+            fleet = network.servers(fleet.servers.len() + 1, OTHERS_WAIT).await;
+        }
+        let offered = offered(&fleet);
+        if let Some(task) = wanted.into_iter().find(|task| !offered.contains(*task)) {
+            let offered: Vec<String> = offered.iter().map(TaskId::to_string).collect();
+            bail!("task: expected one of {}, got {task}", offered.join(", "));
+        }
+        Ok(())
+    }
+
+    fn nobody(&self, fleet: &Fleet) -> String {
+        let Site { connect, fleet: name, .. } = &self.site;
+        let place =
+            if connect.is_empty() { String::new() } else { format!(" at {}", connect.join(", ")) };
+        let mut text = format!("no environment server found{place} (fleet {name:?})");
+        for (server, reason) in &fleet.undescribed {
+            text.push_str(&format!("; server {server}: {reason}"));
+        }
+        text
+    }
+
+    /// The scorer of now and those that are published later, and what must live for that.
+    async fn scorers(&self, network: &Network) -> Result<(Scorers, Option<VerifierSubscriber>)> {
+        let (sender, scorers) = watch::channel(self.scorer.clone());
+        let Some((name, load)) = &self.follow_verifier else { return Ok((scorers, None)) };
+        let follower = VerifierSubscriber::declare(network, name).await?;
+        let listening = network.listening();
+        if listening.is_empty() {
+            eprintln!("waiting for versions of verifier {name} at {}", self.site.connect.join(", "));
+        } else {
+            eprintln!("waiting for versions of verifier {name} at {}", listening.join(", "));
+        }
+        let mut latest = follower.latest();
+        latest.mark_changed();
+        tokio::spawn(follow(latest, Arc::clone(load), sender));
+        let is_needed = self.settings.iter().any(|setting| setting.strategy.needs_verifier());
+        if is_needed && self.scorer.is_none() {
+            let mut first = scorers.clone();
+            let first = first.wait_for(Option::is_some);
+            let secs = VERIFIER_WAIT.as_secs();
+            tokio::time::timeout(VERIFIER_WAIT, first)
+                .await
+                .with_context(|| {
+                    format!("no version of verifier {name} for this policy was published within {secs} s")
+                })?
+                .context("the network is closed")?;
+        }
+        Ok((scorers, Some(follower)))
+    }
+}
+
+type Scorers = watch::Receiver<Option<Arc<dyn Scorer>>>;
+
+/// Takes up every published version that fits the policy.
+async fn follow(
+    mut latest: watch::Receiver<Option<Arc<VerifierUpdate>>>,
+    load: LoadScorer,
+    scorers: watch::Sender<Option<Arc<dyn Scorer>>>,
+) {
+    while latest.changed().await.is_ok() {
+        let Some(update) = latest.borrow_and_update().clone() else { continue };
+        match load(&update) {
+            Ok(scorer) => {
+                let digest = scorer.digest().get(..12).unwrap_or_default().to_owned();
+                eprintln!("verifier {} is now {digest}", update.name);
+                scorers.send_replace(Some(scorer));
+            }
+            Err(error) => tracing::warn!("the verifier {} is ignored: {error:#}", update.name),
+        }
+    }
+}
+
+/// Every task in every variant that some server offers.
+fn offered(fleet: &Fleet) -> BTreeSet<TaskId> {
+    let tasks = fleet.servers.values().flat_map(|server| &server.tasks);
+    tasks.map(|offer| TaskId::new(&offer.task, &offer.variant)).collect()
+}
+
+impl std::fmt::Debug for Experiment {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.debug_struct("Experiment").field("title", &self.title).finish_non_exhaustive()
+    }
+}
+
+/// The folder of an experiment, by default one that is named after what decides its results.
+pub fn default_folder(title: &str, digest: &str) -> PathBuf {
+    PathBuf::from("runs").join(format!("{title}-{}", digest.get(..8).unwrap_or(digest)))
+}

@@ -1,0 +1,117 @@
+//! Decisions in batches: whatever episodes are ready share one pass of the policy.
+//!
+//! No episode waits for a server of another one. While a batch is decided, the episodes of the one before it are stepped
+//! and come back; a batch that would be small waits for them, but never for long.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use decision::{Decider, Decision, DecisionFault, DecisionRequest, EpisodeContext, Observation};
+use tokio::runtime::Handle;
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::{Instant, timeout_at};
+
+/// How long a batch that holds fewer than half of the running episodes waits for more of them.
+const BATCH_WAIT: Duration = Duration::from_millis(4);
+/// Episodes that may wait to be read; every one of them is held by a worker of its own.
+const WAITING_MAX: usize = 4096;
+
+/// Hands episodes to the decider and their decisions back.
+pub struct DecisionBatcher {
+    waiting: mpsc::Sender<Waiting>,
+}
+
+/// An episode that waits for its decision.
+struct Waiting {
+    observation: Observation,
+    context: EpisodeContext,
+    answer: oneshot::Sender<Answer>,
+}
+
+/// What comes back.
+pub struct Answer {
+    /// The episode's memory, this decision included.
+    pub context: EpisodeContext,
+    /// What to do.
+    pub decision: Result<Decision, DecisionFault>,
+    /// From the observations of the batch to its chosen actions.
+    pub batch_time: Duration,
+    /// Decisions that were made together.
+    pub batch_size: usize,
+}
+
+impl DecisionBatcher {
+    /// Starts deciding in the background; `active` is the number of episodes that are running.
+    pub fn start(decider: Arc<Decider>, active: Arc<AtomicUsize>) -> DecisionBatcher {
+        let (waiting, received) = mpsc::channel(WAITING_MAX);
+        tokio::spawn(decide_batches(decider, received, active));
+        DecisionBatcher { waiting }
+    }
+
+    /// Waits for a decision. None when the rollout is over.
+    pub async fn decide(
+        &self,
+        observation: Observation,
+        context: EpisodeContext,
+    ) -> Option<Answer> {
+        let (answer, answered) = oneshot::channel();
+        self.waiting.send(Waiting { observation, context, answer }).await.ok()?;
+        answered.await.ok()
+    }
+}
+
+async fn decide_batches(
+    decider: Arc<Decider>,
+    mut received: mpsc::Receiver<Waiting>,
+    active: Arc<AtomicUsize>,
+) {
+    while let Some(first) = received.recv().await {
+        let batch = gather(first, &mut received, &active).await;
+        let (decider, runtime) = (Arc::clone(&decider), Handle::current());
+        // A policy computes on all cores for tens of milliseconds: not on a thread that others need for their steps.
+        let decided =
+            tokio::task::spawn_blocking(move || runtime.block_on(decide(&decider, batch))).await;
+        if let Err(error) = decided {
+            // The episodes of the batch learn that their answer will not come.
+            tracing::error!("a decision panicked: {error}");
+        }
+    }
+}
+
+/// All episodes that are ready; where these are few, those as well that become ready soon.
+async fn gather(
+    first: Waiting,
+    received: &mut mpsc::Receiver<Waiting>,
+    active: &AtomicUsize,
+) -> Vec<Waiting> {
+    let deadline = Instant::now() + BATCH_WAIT;
+    let mut batch = vec![first];
+    loop {
+        while let Ok(next) = received.try_recv() {
+            batch.push(next);
+        }
+        if 2 * batch.len() >= active.load(Ordering::Acquire) {
+            return batch;
+        }
+        match timeout_at(deadline, received.recv()).await {
+            Ok(Some(next)) => batch.push(next),
+            Ok(None) | Err(_) => return batch,
+        }
+    }
+}
+
+async fn decide(decider: &Decider, mut batch: Vec<Waiting>) {
+    let begun = Instant::now();
+    let requests = batch
+        .iter_mut()
+        .map(|one| DecisionRequest { observation: &one.observation, context: &mut one.context })
+        .collect();
+    let decisions = decider.decide(requests).await;
+    let (batch_time, batch_size) = (begun.elapsed(), batch.len());
+    for (one, decision) in batch.into_iter().zip(decisions) {
+        let answer = Answer { context: one.context, decision, batch_time, batch_size };
+        // The episode may have been dropped meanwhile.
+        let _ = one.answer.send(answer);
+    }
+}

@@ -1,0 +1,145 @@
+//! Event sinks: what is told of a run while it goes on, on a thread of its own.
+//!
+//! Rollouts emit events and go on. Writing records, labels and videos blocks, and blocks this thread alone; only the
+//! episode that ended waits until its record is durable.
+
+mod outcomes;
+mod progress;
+mod store;
+mod video;
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+use ::store::record::EpisodeRecord;
+use ::store::run::FaultRecord;
+use anyhow::{Context, Error, Result, anyhow, bail, ensure};
+use protocol::Image;
+use tokio::sync::{mpsc, oneshot};
+
+pub use outcomes::OutcomeSink;
+pub use progress::{Counts, Progress};
+pub use store::StoreSink;
+pub use video::VideoSink;
+
+/// Events that may wait for the sinks. One with a frame holds up to 150 kB at 224 pixels.
+const WAITING_MAX: usize = 256;
+
+/// What happens in a run.
+#[derive(Debug, Clone)]
+pub enum Event {
+    /// An episode was reset.
+    Started {
+        /// Its name within the run.
+        id: String,
+        /// What is seen, where videos are made.
+        image: Option<Image>,
+    },
+    /// One control step is over.
+    Stepped {
+        /// The episode's name within the run.
+        id: String,
+        /// What is seen, where videos are made.
+        image: Option<Image>,
+    },
+    /// An episode ran to its end.
+    Recorded(Box<EpisodeRecord>),
+    /// An attempt broke.
+    Faulted(FaultRecord),
+    /// Something that a person who watches should know.
+    Notice(String),
+}
+
+/// Takes events, one after the other. May block.
+pub trait EventSink: Send {
+    /// Takes one event. An error ends the run.
+    fn on(&mut self, event: &Event) -> Result<()>;
+
+    /// After the last event.
+    fn finish(&mut self) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// The sinks of a run, on a thread of their own.
+pub struct Sinks {
+    events: mpsc::Sender<Message>,
+    failure: Arc<Mutex<Option<String>>>,
+    thread: JoinHandle<()>,
+}
+
+struct Message {
+    event: Event,
+    /// Told when every sink has taken the event.
+    taken: Option<oneshot::Sender<()>>,
+}
+
+impl Sinks {
+    /// Starts the thread; every event goes to the sinks in this order.
+    pub fn start(sinks: Vec<Box<dyn EventSink>>) -> Result<Sinks> {
+        let (events, received) = mpsc::channel(WAITING_MAX);
+        let failure = Arc::new(Mutex::new(None));
+        let failed = Arc::clone(&failure);
+        let run = move || {
+            if let Err(error) = drain(sinks, received) {
+                *lock(&failed) = Some(format!("{error:#}"));
+            }
+        };
+        let thread = std::thread::Builder::new()
+            .name("event sinks".to_owned())
+            .spawn(run)
+            .context("cannot start the thread of the event sinks")?;
+        Ok(Sinks { events, failure, thread })
+    }
+
+    /// Hands an event over. The error is that of a sink which failed on this event or on one before.
+    pub async fn emit(&self, event: Event) -> Result<()> {
+        let sent = self.events.send(Message { event, taken: None }).await;
+        sent.map_err(|_| self.failed())
+    }
+
+    /// Hands an episode's record over and waits until it is durable.
+    pub async fn record(&self, record: EpisodeRecord) -> Result<()> {
+        let (taken, told) = oneshot::channel();
+        let event = Event::Recorded(Box::new(record));
+        let sent = self.events.send(Message { event, taken: Some(taken) }).await;
+        sent.map_err(|_| self.failed())?;
+        told.await.map_err(|_| self.failed())
+    }
+
+    /// Waits until every event is taken.
+    pub async fn finish(self) -> Result<()> {
+        let Sinks { events, failure, thread } = self;
+        drop(events);
+        let joined = tokio::task::spawn_blocking(move || thread.join()).await;
+        let joined = joined.context("cannot wait for the event sinks")?;
+        ensure!(joined.is_ok(), "an event sink panicked");
+        match lock(&failure).take() {
+            Some(reason) => bail!(reason),
+            None => Ok(()),
+        }
+    }
+
+    /// Why the thread has ended. It may still be about to say so.
+    fn failed(&self) -> Error {
+        let reason = lock(&self.failure).clone();
+        anyhow!(reason.unwrap_or_else(|| "an event sink failed".to_owned()))
+    }
+}
+
+fn drain(mut sinks: Vec<Box<dyn EventSink>>, mut received: mpsc::Receiver<Message>) -> Result<()> {
+    while let Some(Message { event, taken }) = received.blocking_recv() {
+        for sink in &mut sinks {
+            sink.on(&event)?;
+        }
+        if let Some(taken) = taken {
+            // The episode may have been dropped meanwhile; its record is kept all the same.
+            let _ = taken.send(());
+        }
+    }
+    sinks.iter_mut().try_for_each(|sink| sink.finish())
+}
+
+fn lock(failure: &Mutex<Option<String>>) -> MutexGuard<'_, Option<String>> {
+    failure.lock().unwrap_or_else(PoisonError::into_inner)
+}

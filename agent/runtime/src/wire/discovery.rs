@@ -1,0 +1,282 @@
+//! Which servers a network sees: who is alive, when each simulation last moved, what each offers.
+//!
+//! zenoh's callbacks keep the status of every server; a background task asks those that are new what they offer. Nothing
+//! here is waited for by an episode.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use anyhow::{anyhow, ensure};
+use protocol::{Description, Heartbeat, Keys, Message, decode};
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep_until};
+use zenoh::Session;
+use zenoh::sample::{Sample, SampleKind};
+
+/// A server that does not answer a query in this time is asked again: the first query may be faster than routing.
+const DESCRIBE_TIMEOUT: Duration = Duration::from_secs(2);
+/// The first pause between two queries to a server that did not describe itself, doubled each time.
+const DESCRIBE_PAUSE: Duration = Duration::from_millis(500);
+/// The longest such pause.
+const DESCRIBE_PAUSE_MAX: Duration = Duration::from_secs(30);
+/// A server's memory is reported when it exceeds this, and each time that it has doubled since.
+const RESIDENT_BYTES_REPORTED: u64 = 4 << 30;
+
+/// What is known of one server at a moment.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ServerStatus {
+    /// Its liveliness token stands.
+    pub alive: bool,
+    /// How often the token has gone: a session of before is gone with it.
+    pub losses: u32,
+    /// When its simulation last moved.
+    pub beaten_at: Option<Instant>,
+}
+
+/// The servers that are alive, by their ids.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Fleet {
+    /// Those that described themselves.
+    pub servers: BTreeMap<String, Description>,
+    /// Why the others cannot be used.
+    pub undescribed: BTreeMap<String, String>,
+}
+
+/// Kept up to date by zenoh's callbacks and by a task in the background.
+#[derive(Debug, Default)]
+pub struct Discovery {
+    status: Mutex<HashMap<String, Known>>,
+    /// Tokens came or went; heartbeats do not count.
+    changed: watch::Sender<()>,
+    fleet: watch::Sender<Fleet>,
+}
+
+#[derive(Debug)]
+struct Known {
+    status: watch::Sender<ServerStatus>,
+    /// The next memory size that is reported.
+    resident_bytes_reported: u64,
+    /// Whether an unreadable heartbeat was reported.
+    is_unreadable_reported: bool,
+}
+
+impl Discovery {
+    /// Starts to watch; the session's end ends it.
+    pub async fn watch(session: &Session, keys: &Keys) -> anyhow::Result<Arc<Self>> {
+        let discovery = Arc::new(Self::default());
+        let (watched, names) = (Arc::clone(&discovery), keys.clone());
+        session
+            .liveliness()
+            .declare_subscriber(keys.servers())
+            .history(true)
+            .callback(move |sample| watched.on_token(&names, &sample))
+            .background()
+            .await
+            .map_err(|error| anyhow!("cannot watch for servers: {error}"))?;
+        let (watched, names) = (Arc::clone(&discovery), keys.clone());
+        session
+            .declare_subscriber(keys.heartbeats())
+            .callback(move |sample| watched.on_heartbeat(&names, &sample))
+            .background()
+            .await
+            .map_err(|error| anyhow!("cannot watch heartbeats: {error}"))?;
+        let asked = Arc::clone(&discovery);
+        tokio::spawn(asked.ask_new_servers(session.clone(), keys.clone()));
+        Ok(discovery)
+    }
+
+    /// The status of one server from now on.
+    pub fn status(&self, server: &str) -> watch::Receiver<ServerStatus> {
+        self.update(server, |_| false)
+    }
+
+    /// The servers that are alive, from now on.
+    pub fn fleet(&self) -> watch::Receiver<Fleet> {
+        self.fleet.subscribe()
+    }
+
+    /// Asks every new server to describe itself, all at once and each again until it does.
+    async fn ask_new_servers(self: Arc<Self>, session: Session, keys: Keys) {
+        let mut changed = self.changed.subscribe();
+        let mut asked = JoinSet::new();
+        let mut asking: HashSet<String> = HashSet::new();
+        let mut retries: HashMap<String, (Instant, Duration)> = HashMap::new();
+        while !session.is_closed() {
+            changed.mark_unchanged();
+            let alive = self.alive();
+            self.forget_all_but(&alive);
+            retries.retain(|server, _| alive.contains(server));
+            let described = self.fleet.borrow().servers.clone();
+            for server in &alive {
+                let is_due = retries.get(server).is_none_or(|(due, _)| *due <= Instant::now());
+                if is_due && !described.contains_key(server) && asking.insert(server.clone()) {
+                    let (session, keys, server) = (session.clone(), keys.clone(), server.clone());
+                    asked.spawn(async move {
+                        (server.clone(), describe(session, keys, server).await)
+                    });
+                }
+            }
+            let due = retries.iter().filter(|(server, _)| !asking.contains(*server));
+            let due = due.map(|(_, (due, _))| *due).min();
+            let again = due.unwrap_or_else(|| Instant::now() + DESCRIBE_PAUSE_MAX);
+            tokio::select! {
+                Some(answer) = asked.join_next(), if !asked.is_empty() => {
+                    // A panic would be a defect of ours and is reported by its hook.
+                    let Ok((server, answer)) = answer else { continue };
+                    asking.remove(&server);
+                    self.note_answer(server, answer, &mut retries);
+                }
+                _ = changed.changed() => {}
+                () = sleep_until(again) => {}
+            }
+        }
+    }
+
+    fn note_answer(
+        &self,
+        server: String,
+        answer: anyhow::Result<Description>,
+        retries: &mut HashMap<String, (Instant, Duration)>,
+    ) {
+        match answer {
+            Ok(description) => {
+                retries.remove(&server);
+                self.fleet.send_modify(|fleet| {
+                    fleet.undescribed.remove(&server);
+                    fleet.servers.insert(server, description);
+                });
+            }
+            Err(error) => {
+                let pause = retries.get(&server).map_or(DESCRIBE_PAUSE, |(_, pause)| *pause * 2);
+                let pause = pause.min(DESCRIBE_PAUSE_MAX);
+                retries.insert(server.clone(), (Instant::now() + pause, pause));
+                let reason = format!("{error:#}");
+                self.fleet.send_if_modified(|fleet| {
+                    let is_new = fleet.undescribed.get(&server) != Some(&reason);
+                    if is_new {
+                        tracing::warn!("server {server} is left out: {reason}");
+                        fleet.undescribed.insert(server, reason);
+                    }
+                    is_new
+                });
+            }
+        }
+    }
+
+    fn forget_all_but(&self, alive: &HashSet<String>) {
+        self.fleet.send_if_modified(|fleet| {
+            let before = fleet.servers.len() + fleet.undescribed.len();
+            fleet.servers.retain(|server, _| alive.contains(server));
+            fleet.undescribed.retain(|server, _| alive.contains(server));
+            fleet.servers.len() + fleet.undescribed.len() != before
+        });
+    }
+
+    fn alive(&self) -> HashSet<String> {
+        let known = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        known
+            .iter()
+            .filter(|(_, known)| known.status.borrow().alive)
+            .map(|(server, _)| server.clone())
+            .collect()
+    }
+
+    fn on_token(&self, keys: &Keys, sample: &Sample) {
+        let Some(server) = keys.server_of(sample.key_expr().as_str()) else { return };
+        let alive = sample.kind() == SampleKind::Put;
+        self.update(server, |status| {
+            status.losses += u32::from(status.alive && !alive);
+            std::mem::replace(&mut status.alive, alive) != alive
+        });
+        self.changed.send_replace(());
+    }
+
+    fn on_heartbeat(&self, keys: &Keys, sample: &Sample) {
+        let Some(server) = keys.server_of(sample.key_expr().as_str()) else { return };
+        let bytes = sample.payload().len();
+        let heartbeat = if bytes > Heartbeat::BYTES_MAX {
+            Err(format!("expected at most {} bytes, got {bytes}", Heartbeat::BYTES_MAX))
+        } else {
+            decode::<Heartbeat>(&sample.payload().to_bytes()).map_err(|error| error.to_string())
+        };
+        match heartbeat {
+            Ok(heartbeat) => {
+                self.update(server, |status| {
+                    status.beaten_at = Some(Instant::now());
+                    true
+                });
+                self.report_memory(server, heartbeat.resident_bytes);
+            }
+            Err(reason) => self.report_unreadable(server, &reason),
+        }
+    }
+
+    /// Once per server: it comes twice a second.
+    fn report_unreadable(&self, server: &str, reason: &str) {
+        let mut known = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = known.entry(server.to_owned()).or_default();
+        if !std::mem::replace(&mut known.is_unreadable_reported, true) {
+            tracing::warn!("server {server}: its heartbeats cannot be read: {reason}");
+        }
+    }
+
+    /// A simulator that leaks takes its machine down in the end; it is named before.
+    fn report_memory(&self, server: &str, resident_bytes: u64) {
+        let mut known = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = known.entry(server.to_owned()).or_default();
+        if resident_bytes >= known.resident_bytes_reported {
+            known.resident_bytes_reported = resident_bytes.saturating_mul(2);
+            let gigabytes = resident_bytes as f64 / 1e9;
+            tracing::warn!("server {server} holds {gigabytes:.1} GB of memory");
+        }
+    }
+
+    /// Changes a server's status; `change` says whether watchers need to look.
+    fn update(
+        &self,
+        server: &str,
+        change: impl FnOnce(&mut ServerStatus) -> bool,
+    ) -> watch::Receiver<ServerStatus> {
+        let mut known = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = known.entry(server.to_owned()).or_default();
+        known.status.send_if_modified(change);
+        known.status.subscribe()
+    }
+}
+
+impl Default for Known {
+    fn default() -> Self {
+        Known {
+            status: watch::Sender::default(),
+            resident_bytes_reported: RESIDENT_BYTES_REPORTED,
+            is_unreadable_reported: false,
+        }
+    }
+}
+
+/// Asks one server what it is.
+pub(super) async fn describe(
+    session: Session,
+    keys: Keys,
+    server: String,
+) -> anyhow::Result<Description> {
+    let replies = session
+        .get(keys.describe(&server)?)
+        .timeout(DESCRIBE_TIMEOUT)
+        .await
+        .map_err(|error| anyhow!("cannot be asked for its description: {error}"))?;
+    let secs = DESCRIBE_TIMEOUT.as_secs();
+    let silent = || anyhow!("did not describe itself within {secs} s");
+    let reply = replies.recv_async().await.map_err(|_| silent())?;
+    let sample = reply.result().map_err(|_| silent())?;
+    let read = || -> anyhow::Result<Description> {
+        protocol::codec::check_size::<Description>(sample.payload().len())?;
+        let description: Description = decode(&sample.payload().to_bytes())?;
+        let name = &description.server;
+        ensure!(*name == server, "expected a description of server {server}, got one of {name}");
+        Ok(description)
+    };
+    read().map_err(|error| anyhow!("its description cannot be read: {error:#}"))
+}

@@ -1,0 +1,368 @@
+//! The sessions of a run: opened where there is room, used for one episode after the other.
+//!
+//! Each episode waits for its own session alone. A server that does not answer costs the episodes that it has: it is left
+//! out for a while that grows, and until it has opened one session it is asked for one at a time.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use anyhow::{Result, bail};
+use decision::TaskId;
+use protocol::{Description, Open, PROTOCOL_VERSION, TaskDescription};
+use tokio::sync::{Notify, watch};
+use tokio::time::Instant;
+
+use super::discovery::Fleet;
+use super::{Environment, Network};
+use crate::fault::EnvironmentFault;
+use crate::servers::LocalServers;
+use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
+
+/// A server that refused, most often because it is full, is asked again after this long.
+const REFUSED_PAUSE: Duration = Duration::from_secs(1);
+/// The first time for which a server that did not answer is left out, doubled each time.
+const BACKOFF: Duration = Duration::from_secs(30);
+/// The longest such time.
+const BACKOFF_MAX: Duration = Duration::from_secs(600);
+
+/// What the sessions of a run have in common.
+#[derive(Debug, Clone)]
+pub struct PoolOptions {
+    /// Height and width of the images that the policy wants.
+    pub image_size: (usize, usize),
+    /// Numbers of the policy's actions.
+    pub action_length: usize,
+    /// What sessions say of their holder.
+    pub holder: String,
+    /// The simulator of the episodes that the run has already.
+    pub simulator: Option<String>,
+    /// How long a run without any session waits for the first.
+    pub first_wait: Duration,
+    /// How long a run that had sessions waits for one to come back.
+    pub wait: Duration,
+}
+
+/// Opens sessions over zenoh.
+pub struct ZenohPool {
+    network: Network,
+    local: Option<Arc<LocalServers>>,
+    options: PoolOptions,
+    fleet: watch::Receiver<Fleet>,
+    state: Mutex<State>,
+    /// A session came back, or an attempt to open one ended.
+    freed: Notify,
+}
+
+#[derive(Default)]
+struct State {
+    /// All episodes of a run happen in one simulator of one version.
+    simulator: Option<String>,
+    /// Sessions without an episode, and whether their observations carry the expert's action.
+    idle: Vec<(Session<Environment>, bool)>,
+    /// Sessions of this run by server, those that are being opened included.
+    in_use: BTreeMap<String, usize>,
+    /// Servers that have opened a session.
+    proven: BTreeSet<String>,
+    /// Servers that are left out, until when.
+    backoff: BTreeMap<String, Backoff>,
+    /// Why a server cannot serve this run at all; reported once.
+    incompatible: BTreeMap<String, String>,
+    /// What servers said last when they gave no session.
+    refusals: BTreeMap<String, String>,
+    /// Since when this run has had no session.
+    idle_since: Option<Instant>,
+}
+
+struct Backoff {
+    until: Instant,
+    pause: Duration,
+}
+
+/// A server that may be asked.
+struct Chosen {
+    server: String,
+    simulator: String,
+    task: TaskDescription,
+}
+
+impl ZenohPool {
+    /// A pool on a network; `local` are the servers that were started here.
+    pub fn new(network: Network, local: Option<Arc<LocalServers>>, options: PoolOptions) -> ZenohPool {
+        let fleet = network.fleet();
+        let state = State { simulator: options.simulator.clone(), ..State::default() };
+        ZenohPool { network, local, options, fleet, state: Mutex::new(state), freed: Notify::new() }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// An idle session of a server that offers the task.
+    fn idle(&self, request: &SessionRequest, fleet: &Fleet) -> Option<Session<Environment>> {
+        let mut state = self.state();
+        let fits = |(session, has_expert): &(Session<Environment>, bool)| {
+            let description = fleet.servers.get(&session.info.server);
+            let task = description.and_then(|server| offered(server, &request.task));
+            task.filter(|_| *has_expert == request.needs_expert).cloned()
+        };
+        let found =
+            state.idle.iter().enumerate().find_map(|(index, one)| Some((index, fits(one)?)));
+        let (index, task) = found?;
+        let (mut session, _) = state.idle.swap_remove(index);
+        session.info.task = task;
+        Some(session)
+    }
+
+    /// Reserves a session on the server with the fewest of this run, among those that may be asked now.
+    fn reserve(&self, request: &SessionRequest, fleet: &Fleet) -> Option<Chosen> {
+        let mut state = self.state();
+        let now = Instant::now();
+        self.check_compatible(&mut state, &request.task, fleet);
+        let may_be_asked = |server: &&Description| {
+            let id = &server.server;
+            let opening = state.in_use.get(id).copied().unwrap_or(0);
+            offered(server, &request.task).is_some()
+                && !state.incompatible.contains_key(id)
+                && state.backoff.get(id).is_none_or(|backoff| backoff.until <= now)
+                && (opening == 0 || state.proven.contains(id))
+        };
+        let fewest = |server: &&Description| state.in_use.get(&server.server).copied().unwrap_or(0);
+        let chosen = fleet.servers.values().filter(may_be_asked).min_by_key(fewest)?;
+        let chosen = Chosen {
+            server: chosen.server.clone(),
+            simulator: simulator(chosen),
+            task: offered(chosen, &request.task)?.clone(),
+        };
+        state.add(&chosen.server, 1);
+        // A session's kind is settled when it is opened: one of the other kind makes room.
+        let other = state.idle.iter().position(|(idle, _)| idle.info.server == chosen.server);
+        if let Some(index) = other {
+            let (idle, _) = state.idle.swap_remove(index);
+            state.add(&idle.info.server, -1);
+        }
+        Some(chosen)
+    }
+
+    /// Notes and reports servers whose simulator is not the run's, or whose task the policy cannot act in.
+    fn check_compatible(&self, state: &mut State, task: &TaskId, fleet: &Fleet) {
+        state.incompatible.retain(|server, _| fleet.servers.contains_key(server));
+        for (id, server) in &fleet.servers {
+            let Some(offer) = offered(server, task) else { continue };
+            let (expected, got) = (self.options.action_length, offer.action.len());
+            let own = simulator(server);
+            let reason = if got != expected {
+                format!(
+                    "task {task}: expected actions of {expected} numbers, as the policy's are, got {got}"
+                )
+            } else if let Some(expected) = state.simulator.as_ref().filter(|run| **run != own) {
+                format!("expected the run's simulator, {expected}, got {own}")
+            } else {
+                continue;
+            };
+            if state.incompatible.get(id) != Some(&reason) {
+                tracing::warn!("server {id} is left out: {reason}");
+                state.incompatible.insert(id.clone(), reason);
+            }
+        }
+    }
+
+    async fn open(
+        &self,
+        chosen: Chosen,
+        request: &SessionRequest,
+    ) -> Result<Session<Environment>, EnvironmentFault> {
+        let open = Open {
+            protocol: PROTOCOL_VERSION,
+            task: request.task.task.clone(),
+            variant: request.task.variant.clone(),
+            image_height: self.options.image_size.0 as u32,
+            image_width: self.options.image_size.1 as u32,
+            expert: request.needs_expert,
+            holder: self.options.holder.clone(),
+        };
+        let Chosen { server, simulator, task } = chosen;
+        let opened = Environment::open(&self.network, &server, open).await;
+        let mut state = self.state();
+        self.freed.notify_waiters();
+        match opened {
+            Ok(environment) => {
+                let run = state.simulator.get_or_insert_with(|| simulator.clone()).clone();
+                if run != simulator {
+                    // Another server was faster; this one is reported when servers are looked at next.
+                    state.add(&server, -1);
+                    return Err(EnvironmentFault::Refused {
+                        reason: format!("expected the run's simulator, {run}, got {simulator}"),
+                    });
+                }
+                state.proven.insert(server.clone());
+                state.refusals.remove(&server);
+                state.idle_since = None;
+                Ok(Session { info: SessionInfo { server, simulator, task }, environment })
+            }
+            Err(fault) => {
+                state.add(&server, -1);
+                state.refusals.insert(server.clone(), format!("server {server}: {fault}"));
+                match &fault {
+                    EnvironmentFault::Refused { .. } => state.ask_later(&server),
+                    _ => self.suspect(&mut state, &server, &fault),
+                }
+                Err(fault)
+            }
+        }
+    }
+
+    /// Leaves a server out for a while; one of this machine is killed and started again where it does not answer.
+    fn suspect(&self, state: &mut State, server: &str, fault: &EnvironmentFault) {
+        let pause = state.backoff.get(server).map_or(BACKOFF, |backoff| backoff.pause * 2);
+        let pause = pause.min(BACKOFF_MAX);
+        tracing::warn!("{fault}; it is left out for {} s", pause.as_secs());
+        state.pause(server, pause);
+        state.proven.remove(server);
+        state.idle.retain(|(session, _)| session.info.server != server);
+        if let Some(local) = &self.local {
+            local.replace(server);
+        }
+    }
+
+    /// An error when nothing can come of waiting any longer.
+    fn check_patience(&self, request: &SessionRequest, fleet: &Fleet) -> Result<()> {
+        if let Some(reason) = self.local.as_ref().and_then(|local| local.given_up()) {
+            bail!("{reason}");
+        }
+        let mut state = self.state();
+        if state.in_use.values().sum::<usize>() > state.idle.len() {
+            state.idle_since = None;
+            return Ok(());
+        }
+        let waits = *state.idle_since.get_or_insert_with(Instant::now);
+        let had_any = !state.proven.is_empty() || !state.backoff.is_empty();
+        let patience = if had_any { self.options.wait } else { self.options.first_wait };
+        if waits.elapsed() >= patience {
+            bail!(
+                "no session of {} could be opened within {} s: {}",
+                request.task,
+                patience.as_secs(),
+                state.reasons(fleet)
+            );
+        }
+        Ok(())
+    }
+}
+
+impl SessionPool for ZenohPool {
+    type Environment = Environment;
+
+    async fn acquire(&self, request: &SessionRequest) -> Result<Session<Environment>> {
+        let mut changes = self.fleet.clone();
+        loop {
+            let freed = self.freed.notified();
+            let fleet = changes.borrow_and_update().clone();
+            if let Some(session) = self.idle(request, &fleet) {
+                return Ok(session);
+            }
+            if let Some(chosen) = self.reserve(request, &fleet) {
+                if let Ok(session) = self.open(chosen, request).await {
+                    return Ok(session);
+                }
+                continue;
+            }
+            self.check_patience(request, &fleet)?;
+            tokio::select! {
+                () = freed => {}
+                changed = changes.changed() => if changed.is_err() { bail!("the network is closed") },
+                () = tokio::time::sleep(REFUSED_PAUSE) => {}
+            }
+        }
+    }
+
+    fn release(&self, session: Session<Environment>) {
+        let mut state = self.state();
+        let server = session.info.server.clone();
+        state.backoff.remove(&server);
+        let fleet = self.fleet.borrow();
+        let in_use = |server: &String| state.in_use.get(server).copied().unwrap_or(0);
+        let usable = fleet.servers.keys().filter(|id| !state.incompatible.contains_key(*id));
+        let fewest = usable.map(in_use).min().unwrap_or(0);
+        if in_use(&server) > fewest + 1 {
+            // Another server has come (back): the next session is opened there.
+            state.add(&server, -1);
+        } else {
+            let has_expert = session.environment.has_expert();
+            state.idle.push((session, has_expert));
+        }
+        drop(fleet);
+        drop(state);
+        self.freed.notify_waiters();
+    }
+
+    fn lost(&self, info: &SessionInfo, fault: &EnvironmentFault) {
+        let mut state = self.state();
+        state.add(&info.server, -1);
+        match fault {
+            EnvironmentFault::TimedOut { .. } => self.suspect(&mut state, &info.server, fault),
+            EnvironmentFault::ServerLost { .. } | EnvironmentFault::LinkLost { .. } => {
+                state.idle.retain(|(session, _)| session.info.server != info.server);
+                if let Some(local) = &self.local {
+                    local.replace(&info.server);
+                }
+            }
+            EnvironmentFault::Wire { .. } => self.suspect(&mut state, &info.server, fault),
+            EnvironmentFault::Refused { .. } | EnvironmentFault::Faulted { .. } => {}
+        }
+        drop(state);
+        self.freed.notify_waiters();
+    }
+
+    fn abandoned(&self, info: &SessionInfo) {
+        self.state().add(&info.server, -1);
+        self.freed.notify_waiters();
+    }
+}
+
+impl State {
+    fn add(&mut self, server: &str, more: isize) {
+        let count = self.in_use.entry(server.to_owned()).or_default();
+        *count = count.saturating_add_signed(more);
+    }
+
+    fn pause(&mut self, server: &str, pause: Duration) {
+        let backoff = Backoff { until: Instant::now() + pause, pause };
+        self.backoff.insert(server.to_owned(), backoff);
+    }
+
+    /// For a server that answered, and has no room.
+    fn ask_later(&mut self, server: &str) {
+        let until = Instant::now() + REFUSED_PAUSE;
+        let backoff = self.backoff.entry(server.to_owned());
+        backoff.or_insert(Backoff { until, pause: BACKOFF / 2 }).until = until;
+    }
+
+    /// Why there is no session.
+    fn reasons(&self, fleet: &Fleet) -> String {
+        let mut reasons: Vec<String> = self.refusals.values().cloned().collect();
+        let described = |all: &BTreeMap<String, String>| -> Vec<String> {
+            all.iter().map(|(server, reason)| format!("server {server}: {reason}")).collect()
+        };
+        reasons.extend(described(&self.incompatible));
+        reasons.extend(described(&fleet.undescribed));
+        if reasons.is_empty() { "no server is alive".to_owned() } else { reasons.join("; ") }
+    }
+}
+
+/// What a server offers of a task.
+fn offered<'a>(server: &'a Description, task: &TaskId) -> Option<&'a TaskDescription> {
+    server.tasks.iter().find(|one| one.task == task.task && one.variant == task.variant)
+}
+
+/// What a run's episodes must have in common: a task of another version has other results.
+pub(crate) fn simulator(server: &Description) -> String {
+    let name = format!("{} {}", server.simulator, server.simulator_version);
+    let versions: BTreeSet<u32> = server.tasks.iter().map(|task| task.version).collect();
+    // Left out where every task is its first version, as in runs from before there was a second.
+    if versions.iter().all(|&version| version == 1) {
+        return name;
+    }
+    let versions: Vec<String> = versions.iter().map(u32::to_string).collect();
+    format!("{name}, task version {}", versions.join(" and "))
+}
