@@ -1,26 +1,25 @@
 //! One run from beginning to end: servers, rollouts, records, labels.
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
-use decision::{Decider, Policy, Scorer, Setting, TaskId};
+use decision::{Decider, Policy, PolicyInfo, Scorer, Setting, TaskId, VARIANT_DEFAULT};
 use protocol::VerifierUpdate;
 use store::plan::EpisodePlan;
 use store::queue::{EpisodeQueue, GivenUp, RunQueue};
 use store::record::Versions;
 use store::run::{self, Run};
+use tokio::runtime::Runtime;
 use tokio::sync::watch;
 
 use crate::rollout::{RecordOptions, Rollout};
 use crate::sinks::{EventSink, OutcomeSink, Progress, Sinks, StoreSink, VideoSink};
-use crate::site::{Deployment, Site};
+use crate::site::Deployment;
 use crate::stop::{self, Stop};
-use crate::wire::{
-    Fleet, Network, OutcomePublisher, PoolOptions, VerifierSubscriber, ZenohPool,
-};
+use crate::wire::{Fleet, OutcomePublisher, PoolOptions, VerifierSubscriber, ZenohPool};
 
 /// Discovery timeout for servers that are already running.
 const SERVERS_WAIT: Duration = Duration::from_secs(10);
@@ -50,8 +49,6 @@ pub struct Experiment {
     pub scorer: Option<Arc<dyn Scorer>>,
     /// The name of a published verifier whose newest version is taken up between episodes.
     pub follow_verifier: Option<(String, LoadScorer)>,
-    /// Where the servers are.
-    pub site: Site,
     /// Episodes at once.
     pub sessions: usize,
     /// What records hold.
@@ -75,7 +72,7 @@ pub struct Ending {
 
 impl Ending {
     /// An error when some episode has no outcome, for a partial result must not pass for a whole one.
-    pub fn ensure_complete(&self, folder: &std::path::Path) -> Result<()> {
+    pub fn ensure_complete(&self, folder: &Path) -> Result<()> {
         if self.missing == 0 {
             return Ok(());
         }
@@ -90,20 +87,23 @@ impl Ending {
 }
 
 impl Experiment {
-    /// Runs what is not recorded yet in `run`.
-    pub fn run(&self, run: Run) -> Result<Ending> {
+    /// Runs what is not recorded yet in `run`, on servers that are only started where something is missing. Blocks.
+    pub fn run(
+        &self,
+        run: Run,
+        runtime: &Runtime,
+        deploy: impl FnOnce() -> Result<Deployment>,
+    ) -> Result<Ending> {
         self.check()?;
         let (folder, name) = (run.folder.clone(), run.header.run.clone());
         let recorded = run::recorded(&folder)?;
         let queue = RunQueue::new(&name, &self.plans, &self.settings, &recorded);
         let queue = Arc::new(queue);
-        let runtime =
-            tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
         let mut was_stopped = false;
         if runtime.block_on(queue.progress())?.waiting > 0 {
-            let deployment = self.site.open(&runtime, self.sessions)?;
+            let deployment = deploy()?;
             let result = runtime.block_on(self.roll_out(&deployment, run, Arc::clone(&queue)));
-            let closed = deployment.close(&runtime);
+            let closed = deployment.close(runtime);
             was_stopped = result.with_context(|| {
                 format!("rerun the same command to resume {}", folder.display())
             })?;
@@ -126,7 +126,7 @@ impl Experiment {
     }
 
     /// The run may hold settings that this experiment did not ask for.
-    fn missing(&self, name: &str, folder: &std::path::Path) -> Result<usize> {
+    fn missing(&self, name: &str, folder: &Path) -> Result<usize> {
         let recorded = run::recorded(folder)?;
         let identities = store::queue::identities(name, &self.plans, &self.settings);
         Ok(identities.filter(|identity| !recorded.contains(&identity.id())).count())
@@ -140,9 +140,9 @@ impl Experiment {
         queue: Arc<RunQueue>,
     ) -> Result<bool> {
         let network = &deployment.network;
-        self.check_tasks(network).await?;
+        self.check_tasks(deployment).await?;
         let name = run.header.run.clone();
-        let (scorer, _following) = self.scorers(network).await?;
+        let (scorer, _following) = self.scorers(deployment).await?;
         let summaries = run.summaries()?;
         let simulator = summaries.first().map(|summary| summary.simulator.clone());
         let successes = summaries.iter().filter(|one| one.statistics.is_success).count();
@@ -158,15 +158,7 @@ impl Experiment {
         sinks.push(Box::new(StoreSink::new(run)));
         sinks.push(Box::new(OutcomeSink::new(outcomes)));
         sinks.push(Box::new(progress));
-        let info = self.policy.info();
-        let pool = PoolOptions {
-            image_size: info.image_size,
-            action_length: info.action_space.length(),
-            holder: name,
-            simulator,
-            first_wait: FIRST_SESSION_WAIT,
-            wait: SESSION_WAIT,
-        };
+        let pool = pool_options(self.policy.info(), name, simulator);
         let stop = stop::listen()?;
         let rollout = Rollout {
             decider: Arc::new(Decider::new(Arc::clone(&self.policy))),
@@ -184,14 +176,11 @@ impl Experiment {
     }
 
     /// A task that nobody offers would break every one of its episodes.
-    async fn check_tasks(&self, network: &Network) -> Result<()> {
+    async fn check_tasks(&self, deployment: &Deployment) -> Result<()> {
         let wanted: BTreeSet<&TaskId> = self.plans.iter().map(|plan| &plan.task).collect();
-        let mut fleet = network.servers(self.site.servers.max(1), SERVERS_WAIT).await;
-        if fleet.servers.is_empty() {
-            bail!("{}", self.nobody(&fleet));
-        }
+        let mut fleet = first_servers(deployment).await?;
         if !wanted.is_subset(&offered(&fleet).iter().collect()) {
-            fleet = network.servers(fleet.servers.len() + 1, OTHERS_WAIT).await;
+            fleet = deployment.network.servers(fleet.servers.len() + 1, OTHERS_WAIT).await;
         }
         let offered = offered(&fleet);
         if let Some(task) = wanted.into_iter().find(|task| !offered.contains(*task)) {
@@ -201,28 +190,18 @@ impl Experiment {
         Ok(())
     }
 
-    fn nobody(&self, fleet: &Fleet) -> String {
-        let Site { connect, fleet: name, .. } = &self.site;
-        let place =
-            if connect.is_empty() { String::new() } else { format!(" at {}", connect.join(", ")) };
-        let mut text = format!("no environment server found{place} (fleet {name:?})");
-        for (server, reason) in &fleet.undescribed {
-            text.push_str(&format!("; server {server}: {reason}"));
-        }
-        text
-    }
-
     /// The scorer of now and those that are published later, and what must live for that.
-    async fn scorers(&self, network: &Network) -> Result<(Scorers, Option<VerifierSubscriber>)> {
+    async fn scorers(
+        &self,
+        deployment: &Deployment,
+    ) -> Result<(Scorers, Option<VerifierSubscriber>)> {
+        let Deployment { network, site, .. } = deployment;
         let (sender, scorers) = watch::channel(self.scorer.clone());
         let Some((name, load)) = &self.follow_verifier else { return Ok((scorers, None)) };
         let follower = VerifierSubscriber::declare(network, name).await?;
         let listening = network.listening();
-        if listening.is_empty() {
-            eprintln!("waiting for versions of verifier {name} at {}", self.site.connect.join(", "));
-        } else {
-            eprintln!("waiting for versions of verifier {name} at {}", listening.join(", "));
-        }
+        let places = if listening.is_empty() { &site.connect[..] } else { listening };
+        eprintln!("waiting for versions of verifier {name} at {}", places.join(", "));
         let mut latest = follower.latest();
         latest.mark_changed();
         tokio::spawn(follow(latest, Arc::clone(load), sender));
@@ -263,6 +242,50 @@ async fn follow(
     }
 }
 
+/// How the sessions of a run are opened for a policy.
+pub fn pool_options(policy: &PolicyInfo, holder: String, simulator: Option<String>) -> PoolOptions {
+    PoolOptions {
+        image_size: policy.image_size,
+        action_length: policy.action_space.length(),
+        holder,
+        simulator,
+        first_wait: FIRST_SESSION_WAIT,
+        wait: SESSION_WAIT,
+    }
+}
+
+/// The tasks that servers offer in their default variant, in the order of their descriptions.
+pub async fn default_tasks(deployment: &Deployment) -> Result<Vec<TaskId>> {
+    let fleet = first_servers(deployment).await?;
+    let mut tasks: Vec<TaskId> = Vec::new();
+    for offer in fleet.servers.values().flat_map(|server| &server.tasks) {
+        let task = TaskId::new(&offer.task, &offer.variant);
+        if task.variant == VARIANT_DEFAULT && !tasks.contains(&task) {
+            tasks.push(task);
+        }
+    }
+    ensure!(!tasks.is_empty(), "tasks: expected --tasks, for no server offers a default variant");
+    Ok(tasks)
+}
+
+/// The servers that are found within the discovery timeout; an error when there is none.
+async fn first_servers(deployment: &Deployment) -> Result<Fleet> {
+    let Deployment { site, network, .. } = deployment;
+    let fleet = network.servers(site.servers.max(1), SERVERS_WAIT).await;
+    if !fleet.servers.is_empty() {
+        return Ok(fleet);
+    }
+    let place = match &site.connect[..] {
+        [] => String::new(),
+        connect => format!(" at {}", connect.join(", ")),
+    };
+    let mut text = format!("no environment server found{place} (fleet {:?})", site.fleet);
+    for (server, reason) in &fleet.undescribed {
+        text.push_str(&format!("; server {server}: {reason}"));
+    }
+    bail!(text)
+}
+
 /// Every task in every variant that some server offers.
 fn offered(fleet: &Fleet) -> BTreeSet<TaskId> {
     let tasks = fleet.servers.values().flat_map(|server| &server.tasks);
@@ -273,9 +296,4 @@ impl std::fmt::Debug for Experiment {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.debug_struct("Experiment").field("title", &self.title).finish_non_exhaustive()
     }
-}
-
-/// The folder of an experiment, by default one that is named after what decides its results.
-pub fn default_folder(title: &str, digest: &str) -> PathBuf {
-    PathBuf::from("runs").join(format!("{title}-{}", digest.get(..8).unwrap_or(digest)))
 }

@@ -30,6 +30,8 @@ pub struct Site {
 
 /// An open network, and the servers that were started for it.
 pub struct Deployment {
+    /// What was asked for.
+    pub site: Site,
     /// The way to all servers.
     pub network: Network,
     /// Those of this machine.
@@ -51,7 +53,7 @@ impl Site {
         let program = if self.servers > 0 { Some(self.program()?) } else { None };
         let network = runtime.block_on(Network::open(self.network_options()))?;
         let local = program.map(|program| self.start(program, &network, sessions)).transpose()?;
-        Ok(Deployment { network, local: local.map(Arc::new) })
+        Ok(Deployment { site: self.clone(), network, local: local.map(Arc::new) })
     }
 
     /// What local servers are started with; the first time takes minutes.

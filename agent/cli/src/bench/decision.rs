@@ -1,18 +1,21 @@
 //! One decision at a time: prefill, decode, parse, score, choose.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
+use decision::{
+    Decider, DecisionRequest, EpisodeContext, Observation, Policy, ProposalRequest, Scorer,
+    Setting as EpisodeSetting, Strategy,
+};
+use evaluation::statistics::quantile;
+use protocol::Dimension;
 use serde::Serialize;
-
-use super::torch::{Hello, Torch};
-use super::{Observation, bandwidth, quantile};
-use vla::Vla;
-use decision::ProposalRequest;
-use runtime::rollout::{Scene, candidate_action, score};
-use crate::strategy::Decision;
-use decision::Strategy;
 use verifier::Verifier;
+use vla::Vla;
+
+use super::bandwidth;
+use super::torch::{Hello, Torch};
 
 /// Numbers of candidates that are timed.
 const CANDIDATES: [usize; 5] = [1, 2, 5, 8, 16];
@@ -95,16 +98,17 @@ pub struct Report {
 }
 
 /// What is timed.
-#[derive(Clone, Copy)]
 pub struct DecisionBench<'a> {
     /// Proposes.
-    pub policy: &'a Policy,
+    pub policy: Arc<Vla>,
     /// Scores.
-    pub verifier: &'a Verifier,
+    pub verifier: Arc<Verifier>,
     /// Decisions are made on these in turn.
     pub observations: &'a [Observation],
     /// Passes over all observations that are counted.
     pub rounds: usize,
+    /// Drives the decider; the policy computes in the calling thread.
+    pub runtime: &'a tokio::runtime::Runtime,
 }
 
 impl DecisionBench<'_> {
@@ -112,6 +116,7 @@ impl DecisionBench<'_> {
     pub fn run(&self, mut torch: Option<Torch>, mut progress: impl FnMut(usize)) -> Result<Report> {
         ensure!(self.rounds > 0, "rounds: expected at least 1, got 0");
         let settings = settings();
+        let decider = Decider::new(Arc::clone(&self.policy) as Arc<dyn Policy>);
         let hello = torch.as_ref().map(|torch| torch.hello.clone());
         let torch_settings = hello.as_ref().map(|hello| hello.settings.clone()).unwrap_or_default();
         let mut ours: Vec<Samples> = settings.iter().map(|_| Samples::default()).collect();
@@ -122,7 +127,7 @@ impl DecisionBench<'_> {
             let is_counted = round >= WARM_UP_ROUNDS;
             for (index, observation) in self.observations.iter().enumerate() {
                 for (which, setting) in settings.iter().enumerate() {
-                    let (ms, tokens) = self.decide(observation, *setting, round as u64)?;
+                    let (ms, tokens) = self.decide(&decider, observation, *setting, round as u64)?;
                     if is_counted {
                         ours[which].add(ms, tokens.iter().map(Vec::len).sum());
                     }
@@ -157,31 +162,28 @@ impl DecisionBench<'_> {
     /// Milliseconds of one verified decision, and every candidate's tokens.
     fn decide(
         &self,
+        decider: &Decider,
         observation: &Observation,
         setting: Setting,
         seed: u64,
     ) -> Result<(f64, Vec<Vec<u32>>)> {
-        let DecisionBench { policy, verifier, .. } = self;
-        let Setting { candidates, temperature } = setting;
-        let Observation { image, instruction } = observation;
-        let start = Instant::now();
-        let request = ProposalRequest { image, instruction, candidates, temperature, seed };
-        let proposal = policy.propose(&[request])?.pop().context("no proposal")?;
-        let actions: Vec<_> = proposal.candidates.iter().map(candidate_action).collect();
         // Greedy decoding asks no verifier.
-        let logits = (temperature > 0.0).then(|| {
-            let scene = Scene { instruction: instruction.clone(), ..Scene::default() };
-            score(verifier, &proposal, policy, &mut { scene })
-        });
-        let strategy = if logits.is_some() { Strategy::Verifier } else { Strategy::Greedy };
-        std::hint::black_box(strategy.choose(&Decision {
-            candidates: &actions,
-            logits: logits.as_deref(),
-            expert_action: None,
-            action_scale: &policy.action_scale(),
-        }));
+        let scorer = Arc::clone(&self.verifier) as Arc<dyn Scorer>;
+        let (strategy, scorer) = match setting.temperature {
+            0.0 => (Strategy::Greedy, None),
+            _ => (Strategy::Verifier, Some(scorer)),
+        };
+        let Setting { candidates, temperature } = setting;
+        let setting = EpisodeSetting { strategy, candidates: candidates as u32, temperature };
+        let start = Instant::now();
+        let instruction = observation.instruction.clone();
+        let mut context =
+            EpisodeContext::new(setting, seed, instruction, scorer, &[] as &[Dimension]);
+        let request = DecisionRequest { observation, context: &mut context };
+        let decided = self.runtime.block_on(decider.decide(vec![request]));
+        let decision = decided.into_iter().next().context("no decision")??;
         let ms = start.elapsed().as_secs_f64() * 1e3;
-        Ok((ms, proposal.candidates.into_iter().map(|candidate| candidate.tokens).collect()))
+        Ok((ms, decision.candidates.into_iter().map(|candidate| candidate.tokens).collect()))
     }
 
     fn report(
@@ -216,7 +218,7 @@ impl DecisionBench<'_> {
             torch_hello,
             threads: rayon::current_num_threads(),
             decisions: self.rounds * self.observations.len(),
-            policy: self.policy.digest().to_owned(),
+            policy: self.policy.parser().digest().to_owned(),
             verifier: self.verifier.digest().to_owned(),
             rows,
         })
@@ -230,8 +232,9 @@ impl DecisionBench<'_> {
         let steps = (tokens_mean / setting.candidates as f64).round() as usize;
         let Setting { candidates, temperature } = setting;
         let (mut prefill_ms, mut step_ms) = (f64::INFINITY, f64::INFINITY);
-        for Observation { image, instruction } in self.observations {
-            let request = ProposalRequest { image, instruction, candidates, temperature, seed: 0 };
+        for Observation { image, instruction, state, .. } in self.observations {
+            let request =
+                ProposalRequest { image, state, instruction, candidates, temperature, seed: 0 };
             let timings = self.policy.time(&[request], steps.max(1))?;
             prefill_ms = prefill_ms.min(timings.prefill_ms);
             step_ms = step_ms.min(timings.step_ms);
@@ -284,15 +287,23 @@ mod tests {
 
     #[test]
     fn every_setting_is_timed_on_every_observation() {
-        let agent = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let agent = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("a folder");
         let model = agent.join("models/bridge-small");
-        let policy = Policy::load(&model, DeviceName::Cpu).expect("the shipped policy");
+        let policy = Vla::load(&model, DeviceName::Cpu).expect("the shipped policy");
         let file = model.join("verifier.safetensors");
-        let verifier = Verifier::load(&file, policy.digest()).expect("the shipped verifier");
+        let digest = policy.parser().digest();
+        let verifier = Verifier::load(&file, digest).expect("the shipped verifier");
         let observations =
-            read_observations(&agent.join("tests/fixtures/bridge-small.safetensors"));
+            read_observations(&agent.join("vla/tests/fixtures/bridge-small.safetensors"));
         let observations = &observations.expect("recorded ones")[..2];
-        let bench = DecisionBench { policy: &policy, verifier: &verifier, observations, rounds: 1 };
+        let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+        let bench = DecisionBench {
+            policy: Arc::new(policy),
+            verifier: Arc::new(verifier),
+            observations,
+            rounds: 1,
+            runtime: &runtime,
+        };
         let report = bench.run(None, |_| ()).expect("a report");
         let settings: Vec<Setting> = report.rows.iter().map(|row| row.setting).collect();
         assert_eq!(settings, super::settings());

@@ -6,16 +6,7 @@ use anyhow::{Context, Result, bail, ensure};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
-use decision::Image;
-
-/// A picture of the world and what was to be done.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Observation {
-    /// Of the policy's size.
-    pub image: Image,
-    /// As the task gives it.
-    pub instruction: String,
-}
+use decision::{Image, Observation};
 
 /// Reads tensors `0.image`, `1.image`, … (height, width, 3) in u8, with metadata `observations` and `0.instruction`, ….
 pub fn read(file: &Path) -> Result<Vec<Observation>> {
@@ -44,7 +35,7 @@ pub fn read(file: &Path) -> Result<Vec<Observation>> {
                 let instruction = metadata.get(&name);
                 let instruction =
                     instruction.with_context(|| format!("expected metadata {name}"))?.clone();
-                Ok(Observation { image, instruction })
+                Ok(Observation { image, state: Vec::new(), instruction, expert_action: None })
             })
             .collect()
     };
@@ -57,7 +48,7 @@ mod tests {
 
     #[test]
     fn recorded_observations_are_read_whole_or_refused() {
-        let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
+        let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("../vla/tests/fixtures");
         let observations =
             read(&fixtures.join("bridge-small.safetensors")).expect("the recorded ones");
         assert_eq!(observations.len(), 8);

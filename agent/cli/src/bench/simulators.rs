@@ -5,8 +5,8 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use serde::Serialize;
 
-use super::quantile;
 use super::wire::{EPISODE_STEPS, WARM_UP_STEPS, at_once, circling, open, reset};
+use evaluation::statistics::quantile;
 use runtime::servers::LocalServers;
 use runtime::simulator::{ServerProgram, Simulator};
 use runtime::site::Site;

@@ -5,32 +5,29 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
+use decision::{Decider, Policy, Scorer, Setting, Strategy, TaskId};
+use evaluation::suite::{Layouts, Suite};
+use runtime::experiment::{default_tasks, pool_options};
+use runtime::rollout::{RecordOptions, Rollout};
+use runtime::sinks::{Counts, OutcomeSink, Progress, Sinks, StoreSink};
+use runtime::site::{Deployment, Site};
+use runtime::stop::Stop;
+use runtime::wire::{OutcomePublisher, ZenohPool};
 use serde::Serialize;
 use serde_json::json;
-use tokio::sync::watch;
-
-use vla::Vla;
-use runtime::progress::{Counts, Progress};
-use runtime::rollout::{Crew, Journal, Keep, Rollout};
-use store::queue::Queue;
-use store::run::Run;
-use runtime::servers::LocalServers;
-use runtime::site::Site;
-use runtime::stop::Stop;
-use decision::Strategy;
-use decision::Setting;
-use evaluation::suite::{Layouts, Suite, TASKS};
 use store::plan::SeedRange;
+use store::queue::{EpisodeQueue, RunQueue};
+use store::run::Run;
+use tokio::sync::watch;
 use verifier::Verifier;
-use runtime::wire::{Network, OutcomePublisher};
+use vla::Vla;
+
+use crate::build_info;
 
 /// Control steps of every session before any is counted.
 const WARM_UP_STEPS: u64 = 10;
 /// The shortest episode: so many decisions need at most as many episodes as this says.
 const HORIZON_MIN: u64 = 60;
-/// Local servers are on the network already.
-const SERVERS_WAIT: Duration = Duration::from_secs(30);
-
 /// One number of sessions.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
@@ -51,7 +48,7 @@ pub struct Row {
 /// What is timed.
 pub struct ThroughputBench<'a> {
     /// Proposes.
-    pub policy: &'a Policy,
+    pub policy: Arc<Vla>,
     /// Scores.
     pub verifier: Arc<Verifier>,
     /// Where the servers are started.
@@ -65,48 +62,62 @@ pub struct ThroughputBench<'a> {
 }
 
 impl ThroughputBench<'_> {
-    /// Runs episodes on random layouts of the tuning range; what they come to is thrown away.
+    /// Runs episodes on random layouts of the tuning range; their outcomes are thrown away.
     pub fn run(&self) -> Result<Vec<Row>> {
         ensure!(self.decisions > 0, "decisions: expected at least 1, got 0");
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
         let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        self.site.run(&runtime, most, async |network, local| {
-            let mut rows = Vec::new();
-            for &sessions in self.sessions {
-                rows.push(self.count(network, local, sessions).await?);
-            }
-            Ok(rows)
-        })
+        let deployment = self.site.open(&runtime, most)?;
+        let rows = runtime.block_on(self.rows(&deployment));
+        deployment.close(&runtime)?;
+        rows
+    }
+
+    async fn rows(&self, deployment: &Deployment) -> Result<Vec<Row>> {
+        let tasks = default_tasks(deployment).await?;
+        let mut rows = Vec::new();
+        for &sessions in self.sessions {
+            rows.push(self.count(deployment, &tasks, sessions).await?);
+        }
+        Ok(rows)
     }
 
     async fn count(
         &self,
-        network: &Network,
-        local: Option<&LocalServers>,
+        deployment: &Deployment,
+        tasks: &[TaskId],
         sessions: usize,
     ) -> Result<Row> {
         let folder = tempfile::tempdir().context("cannot make a folder")?;
-        let servers = network.servers(self.site.servers, SERVERS_WAIT).await.len();
         let title = format!("{sessions} sessions");
         let run = Run::open(folder.path(), json!({ "bench": "throughput" }), json!({}))?;
         let name = run.header.run.clone();
         let warm_up = WARM_UP_STEPS * sessions as u64;
-        let queue = self.queue(&name, warm_up + self.decisions, sessions);
-        let progress = Progress::new(&title, queue.len() as u64, 0, 0);
+        let queue = self.queue(&name, tasks, warm_up + self.decisions, sessions);
+        let waiting = queue.progress().await?.waiting as u64;
+        let progress = Progress::new(&title, waiting, 0, 0);
         let counts = progress.counts();
         let (_never, stop) = watch::channel(Stop::No);
-        let outcomes = OutcomePublisher::declare(network, &name).await?;
-        let mut rollout = Rollout {
-            policy: self.policy,
-            verifier: Some(Arc::clone(&self.verifier)),
-            updates: None,
-            crew: Crew::new(network, local, self.policy.image_size(), &name, None, servers),
+        let outcomes = OutcomePublisher::declare(&deployment.network, &name).await?;
+        let (_newer, scorer) =
+            watch::channel(Some(Arc::clone(&self.verifier) as Arc<dyn Scorer>));
+        let policy = Arc::clone(&self.policy) as Arc<dyn Policy>;
+        let pool = pool_options(policy.info(), name, None);
+        let rollout = Rollout {
+            decider: Arc::new(Decider::new(policy)),
+            scorer,
+            pool: ZenohPool::new(deployment.network.clone(), deployment.local.clone(), pool),
+            queue: Arc::new(queue),
+            sinks: Sinks::start(vec![
+                Box::new(StoreSink::new(run)),
+                Box::new(OutcomeSink::new(outcomes)),
+                Box::new(progress),
+            ])?,
             sessions,
-            keep: Keep { all_hidden: false, video: false },
+            options: RecordOptions::default(),
+            versions: build_info::record_versions(),
             stop,
-            journal: Journal { progress, run, outcomes },
-            queue,
         };
         let watched = watch_window(counts, warm_up, self.decisions);
         tokio::pin!(watched);
@@ -115,7 +126,6 @@ impl ThroughputBench<'_> {
             // The last of its steps may be seen after the last episode has ended.
             result = rollout.run() => { result?; watched.await? }
         };
-        rollout.journal.progress.finish();
         let secs = window.elapsed.as_secs_f64();
         Ok(Row {
             sessions,
@@ -128,17 +138,17 @@ impl ThroughputBench<'_> {
     }
 
     /// Episodes enough that no session is idle before so many decisions are made.
-    fn queue(&self, run: &str, decisions: u64, sessions: usize) -> Queue {
+    fn queue(&self, run: &str, tasks: &[TaskId], decisions: u64, sessions: usize) -> RunQueue {
         let episodes = (decisions / HORIZON_MIN) as usize + 2 * sessions;
         let suite = Suite {
-            tasks: TASKS.map(str::to_owned).to_vec(),
-            episodes: episodes.div_ceil(TASKS.len()) as u32,
+            tasks: tasks.to_vec(),
+            episodes: episodes.div_ceil(tasks.len()) as u32,
             layouts: Layouts::Random,
             range: SeedRange::Tuning,
             seed: 0,
         };
         let setting = Setting::new(Strategy::Verifier, self.candidates, 1.0);
-        Queue::new(run, &suite.episodes(), &[setting], &BTreeSet::new())
+        RunQueue::new(run, &suite.episodes(), &[setting], &BTreeSet::new())
     }
 }
 

@@ -17,13 +17,12 @@ use protocol::{Open, PROTOCOL_VERSION, Reset};
 use serde::Serialize;
 use tokio::task::JoinSet;
 
-use super::quantile;
+use evaluation::statistics::quantile;
+use runtime::fault::EnvironmentFault;
 use runtime::simulator::Simulator;
 use runtime::site::Site;
+use runtime::wire::{Environment, Episode, Network};
 use store::plan::SeedRange;
-use evaluation::suite::TASKS;
-use decision::VARIANT_DEFAULT;
-use runtime::wire::{Environment, EnvironmentFault, Episode, Network};
 
 /// Steps before an episode is begun anew: no task's horizon is shorter.
 pub(super) const EPISODE_STEPS: usize = 50;
@@ -83,23 +82,28 @@ impl WireBench<'_> {
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
         let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        self.site.run(&runtime, most, async |network, _| {
-            let found = network.servers(1, SERVER_WAIT).await;
-            let server = &found.first().context("the local server was not to be seen")?.server;
-            let mut environments = Vec::new();
-            for index in 0..most {
-                environments.push(open(network, server, self.side, index).await?);
-            }
-            let mut rows = Vec::new();
-            for &sessions in self.sessions {
-                let rest = environments.split_off(sessions);
-                let (row, used) = self.count(environments).await?;
-                rows.push(row);
-                environments = used;
-                environments.extend(rest);
-            }
-            Ok(rows)
-        })
+        let deployment = self.site.open(&runtime, most)?;
+        let rows = runtime.block_on(self.rows(&deployment.network, most));
+        deployment.close(&runtime)?;
+        rows
+    }
+
+    async fn rows(&self, network: &Network, most: usize) -> Result<Vec<Row>> {
+        let found = network.servers(1, SERVER_WAIT).await.servers;
+        let server = found.keys().next().context("the local server was not found")?;
+        let mut environments = Vec::new();
+        for index in 0..most {
+            environments.push(open(network, server, self.side, index).await?);
+        }
+        let mut rows = Vec::new();
+        for &sessions in self.sessions {
+            let rest = environments.split_off(sessions);
+            let (row, used) = self.count(environments).await?;
+            rows.push(row);
+            environments = used;
+            environments.extend(rest);
+        }
+        Ok(rows)
     }
 
     /// Steps and repetitions of these sessions in turns.

@@ -15,10 +15,10 @@ pub struct Arguments {
     /// Start a server of ours and test it
     #[arg(long, value_enum, conflicts_with = "connect")]
     server: Option<Simulator>,
-    /// Test a server that runs already: its endpoint or a router's, as tcp/HOST:PORT
+    /// Test a server that is running: its endpoint or a router's, as tcp/HOST:PORT
     #[arg(long, value_delimiter = ',')]
     connect: Vec<String>,
-    /// Only servers of the same fleet are looked for
+    /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = "local")]
     fleet: String,
     /// This server, when there are several [default: the first]
@@ -27,15 +27,13 @@ pub struct Arguments {
     /// A Python that has the packages of env-server, instead of the one that rever sets up
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the rows into this file, too
+    /// Write the rows to this file, too
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
 
 /// Sessions of a server that is started here: few, so that all of them can be opened.
 const SESSIONS: usize = 4;
-/// Its idle limit: longer than a session may be without a holder, short enough to be waited for.
-const IDLE_SECS: u32 = 12;
 
 /// Prints each row when it is done; an error when one fails.
 pub fn run(arguments: Arguments) -> Result<()> {
@@ -47,15 +45,15 @@ pub fn run(arguments: Arguments) -> Result<()> {
         simulator: arguments.server.unwrap_or_default(),
         connect: arguments.connect,
         fleet: arguments.fleet,
-        idle_secs: Some(IDLE_SECS),
         python: arguments.python,
         ..Site::default()
     };
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
     let id = arguments.id;
-    let rows = site.run(&runtime, SESSIONS, async |network, _| {
-        test(network, id.as_deref(), &mut print).await
-    })?;
+    let deployment = site.open(&runtime, SESSIONS)?;
+    let rows = runtime.block_on(test(&deployment.network, id.as_deref(), &mut print));
+    deployment.close(&runtime)?;
+    let rows = rows?;
     if let Some(path) = &arguments.json {
         let text = serde_json::to_string_pretty(&rows)?;
         std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;

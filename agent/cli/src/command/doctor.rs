@@ -15,8 +15,7 @@ use runtime::setup::{self, PythonEnvironment};
 use runtime::simulator::{ServerProgram, Simulator};
 use runtime::site::Site;
 use store::plan::SeedRange;
-use evaluation::suite::TASKS;
-use decision::VARIANT_DEFAULT;
+use decision::{ActionSpace, Policy};
 use verifier::Verifier;
 use runtime::wire::{Environment, Network, ServerDescription};
 
@@ -89,7 +88,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
         }
     }
     if python.is_some() || !arguments.connect.is_empty() {
-        let size = policy.as_ref().map_or((128, 128), Policy::image_size);
+        let size = policy.as_ref().map_or((128, 128), |policy| policy.info().image_size);
         let image = check(&mut findings, "world", || check_world(&site, python, size));
         if let (Some(policy), Some((image, instruction))) = (&policy, image) {
             check(&mut findings, "decision", || check_decision(policy, &image, &instruction));
@@ -142,22 +141,22 @@ fn check_rendering(python: &PythonEnvironment) -> Result<((), String)> {
     Ok(((), "one frame rendered with software OpenGL (EGL)".to_owned()))
 }
 
-fn check_policy(folder: &Path) -> Result<(Policy, String)> {
+fn check_policy(folder: &Path) -> Result<(Vla, String)> {
     let begun = Instant::now();
-    let policy = Policy::load(folder, DeviceName::Cpu)?;
-    let (height, width) = policy.image_size();
+    let policy = Vla::load(folder, DeviceName::Cpu)?;
+    let (height, width) = policy.info().image_size;
     let text = format!(
         "{} loaded in {} ms: digest {}, images {height} x {width}, hidden state {}",
         folder.display(),
         begun.elapsed().as_millis(),
-        short(policy.digest()),
-        policy.hidden_size()
+        short(policy.parser().digest()),
+        policy.parser().hidden_size()
     );
     Ok((policy, text))
 }
 
-fn check_verifier(path: &Path, policy: &Policy) -> Result<((), String)> {
-    let verifier = Verifier::load(path, policy.digest())?;
+fn check_verifier(path: &Path, policy: &Vla) -> Result<((), String)> {
+    let verifier = Verifier::load(path, policy.parser().digest())?;
     Ok(((), format!("{}: digest {}, fits the policy", path.display(), short(verifier.digest()))))
 }
 
@@ -183,15 +182,15 @@ async fn try_world(
     network: &Network,
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {
-    let servers = network.servers(1, SERVER_WAIT).await;
-    let server = servers.first().context(
-        "no server was to be seen: start one with `python -m rever_env serve`, or check --connect and --fleet",
+    let servers = network.servers(1, SERVER_WAIT).await.servers;
+    let server = servers.values().next().context(
+        "no environment server found: start one with `python -m rever_env serve`, or check --connect and --fleet",
     )?;
-    let task = TASKS[0];
+    let task = server.tasks.first().context("the server offers no task")?;
     let open = Open {
         protocol: PROTOCOL_VERSION,
-        task: task.to_owned(),
-        variant: VARIANT_DEFAULT.to_owned(),
+        task: task.task.clone(),
+        variant: task.variant.clone(),
         image_height: image_size.0 as u32,
         image_width: image_size.1 as u32,
         expert: false,
@@ -199,14 +198,14 @@ async fn try_world(
     };
     let environment = Environment::open(network, &server.server, open).await?;
     let reset = Reset {
-        task: task.to_owned(),
-        variant: VARIANT_DEFAULT.to_owned(),
+        task: task.task.clone(),
+        variant: task.variant.clone(),
         layout: None,
         seed: SeedRange::Tuning.first(),
     };
     let mut episode = environment.reset(reset).await?;
     let begun = Instant::now();
-    episode.step([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]).await?;
+    episode.step(&ActionSpace::hold_still(&task.action)).await?;
     let step_ms = begun.elapsed().as_secs_f64() * 1000.0;
     let observation = episode.observation().clone();
     let environment = episode.finish();
@@ -226,10 +225,17 @@ fn described(server: &ServerDescription, servers: usize) -> String {
     )
 }
 
-fn check_decision(policy: &Policy, image: &Image, instruction: &str) -> Result<((), String)> {
-    let request = ProposalRequest { image, instruction, candidates: 5, temperature: 1.0, seed: 0 };
+fn check_decision(policy: &Vla, image: &Image, instruction: &str) -> Result<((), String)> {
+    let request = ProposalRequest {
+        image,
+        state: &[],
+        instruction,
+        candidates: 5,
+        temperature: 1.0,
+        seed: 0,
+    };
     let begun = Instant::now();
-    let proposals = policy.propose(&[request])?;
+    let proposals = policy.propose_now(&[request])?;
     let milliseconds = begun.elapsed().as_millis();
     let candidates =
         &proposals.first().ok_or_else(|| anyhow!("the policy answered nothing"))?.candidates;

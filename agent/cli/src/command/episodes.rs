@@ -1,29 +1,46 @@
 //! The arguments that every command which runs episodes takes.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Context, Result, bail};
 use clap::Args;
-
-use runtime::campaign::Campaign;
-use vla::DeviceName;
-use runtime::rollout::Keep;
-use runtime::setup;
+use decision::{Scorer, Setting, TaskId};
+use evaluation::results::{Results, tasks_in_order};
+use evaluation::suite::{Layouts, Suite};
+use runtime::experiment::{self, Ending, Experiment, LoadScorer};
+use runtime::rollout::RecordOptions;
 use runtime::simulator::Simulator;
-use runtime::site::Site;
-use decision::Setting;
-use evaluation::suite::{Suite, TASKS};
+use runtime::site::{Deployment, Site};
+use runtime::setup;
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+use store::plan::SeedRange;
+use store::record::Versions;
+use store::run::{self, Run};
+use tokio::runtime::Runtime;
+use verifier::Verifier;
+use vla::{DeviceName, Vla};
+
+use super::WrongUsage;
+use crate::build_info;
 
 /// Processes on this machine unless others are named.
 const SERVERS_DEFAULT: u16 = 2;
+/// The fleet of those that name none.
+pub const FLEET_DEFAULT: &str = "local";
+/// Episodes at once: enough that a matrix product is worth reading its weights.
+const SESSIONS_DEFAULT: u16 = 16;
+/// The label store of those that name none.
+const LABELS_DEFAULT: &str = "runs/labels.sqlite";
 
 /// Which tasks, where, and what is kept of them.
 #[derive(Debug, Clone, Args)]
 pub struct EpisodesArguments {
-    /// Tasks, separated by commas; all four by default.
-    #[arg(long, value_delimiter = ',', default_values_t = TASKS.map(str::to_owned))]
-    pub tasks: Vec<String>,
-    /// Another number gives other layouts and other samples.
+    /// Tasks, separated by commas, each as TASK or TASK/VARIANT [default: all that the servers offer in their default variant].
+    #[arg(long, value_delimiter = ',')]
+    pub tasks: Vec<TaskId>,
+    /// Seed of the suite: another number gives other layouts and other samples.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
     /// The checkpoint's folder [default: the one that comes with rever].
@@ -35,32 +52,32 @@ pub struct EpisodesArguments {
     /// The verifier's file [default: the one beside the policy's weights, if there is one].
     #[arg(long)]
     pub verifier: Option<PathBuf>,
-    /// Take up every new verifier that is published under this name, between episodes.
+    /// Follow a published verifier: take up its newest version between episodes.
     #[arg(long, value_name = "NAME")]
     pub follow_verifier: Option<String>,
     /// Server processes to start on this machine [default: 2].
     #[arg(long, conflicts_with = "connect", value_parser = clap::value_parser!(u16).range(1..=64))]
     pub servers: Option<u16>,
-    /// What these processes are.
+    /// The simulator of these servers.
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
     pub simulator: Simulator,
-    /// Use servers that run already: endpoints of them or of a router, as tcp/HOST:PORT.
+    /// Use servers that are running: endpoints of them or of a router, as tcp/HOST:PORT.
     #[arg(long, value_delimiter = ',')]
     pub connect: Vec<String>,
-    /// Listen here for others, such as a trainer that publishes verifiers [default: a socket of this machine, told at the start].
+    /// Listen here for others, such as a trainer that publishes verifiers [default: a socket of this machine, printed at the start].
     #[arg(long, value_name = "ENDPOINT", value_delimiter = ',')]
     pub listen: Vec<String>,
-    /// Only servers of the same fleet are used.
-    #[arg(long, default_value = "local")]
+    /// Namespace: peers see each other only within the same fleet.
+    #[arg(long, default_value = FLEET_DEFAULT)]
     pub fleet: String,
     /// Episodes at once.
-    #[arg(long, default_value_t = 16, value_parser = clap::value_parser!(u16).range(1..=256))]
+    #[arg(long, default_value_t = SESSIONS_DEFAULT, value_parser = clap::value_parser!(u16).range(1..=256))]
     pub sessions: u16,
-    /// The run's folder; started again with the same options it goes on [default: under runs/].
+    /// The run's folder; the same command resumes it [default: under runs/].
     #[arg(long)]
     pub out: Option<PathBuf>,
-    /// The label store that takes the outcomes.
-    #[arg(long, default_value = "runs/labels.sqlite")]
+    /// The label store.
+    #[arg(long, default_value = LABELS_DEFAULT)]
     pub labels: PathBuf,
     /// Keep a video of every episode.
     #[arg(long)]
@@ -73,27 +90,159 @@ pub struct EpisodesArguments {
     pub python: Option<PathBuf>,
 }
 
+/// What a command asks for beside the common arguments.
+pub struct Request {
+    /// The command's name, in progress lines and default folders.
+    pub title: &'static str,
+    /// Episodes of each task.
+    pub episodes: u32,
+    /// Where objects start.
+    pub layouts: Layouts,
+    /// What the seeds may be used for.
+    pub range: SeedRange,
+    /// How each episode is run.
+    pub settings: Vec<Setting>,
+}
+
+/// What a command has when its episodes are done.
+pub struct Outcome {
+    /// The run's folder.
+    pub folder: PathBuf,
+    /// The checkpoint's folder.
+    pub policy: PathBuf,
+    /// Rates and gains of all that is recorded.
+    pub results: Results,
+    /// What decides the results: options, versions, build.
+    pub provenance: Value,
+    /// What became of the episodes.
+    pub ending: Ending,
+}
+
+impl Default for EpisodesArguments {
+    /// As the command line has it.
+    fn default() -> Self {
+        EpisodesArguments {
+            tasks: Vec::new(),
+            seed: 0,
+            policy: None,
+            device: DeviceName::Cpu,
+            verifier: None,
+            follow_verifier: None,
+            servers: None,
+            simulator: Simulator::default(),
+            connect: Vec::new(),
+            listen: Vec::new(),
+            fleet: FLEET_DEFAULT.to_owned(),
+            sessions: SESSIONS_DEFAULT,
+            out: None,
+            labels: PathBuf::from(LABELS_DEFAULT),
+            video: false,
+            all_hidden: false,
+            python: None,
+        }
+    }
+}
+
 impl EpisodesArguments {
-    /// The campaign that these arguments, a suite and its settings make.
-    pub fn campaign(&self, title: &str, suite: Suite, settings: Vec<Setting>) -> Result<Campaign> {
-        let policy = policy_folder(self.policy.as_ref())?;
-        let beside = policy.join("verifier.safetensors");
-        let verifier = self.verifier.clone().or_else(|| beside.is_file().then_some(beside));
-        Ok(Campaign {
-            title: title.to_owned(),
-            suite,
-            settings,
-            policy,
-            device: self.device,
-            // Whoever follows a verifier starts with a named one or with the first that is published.
-            verifier: if self.follow_verifier.is_some() { self.verifier.clone() } else { verifier },
-            follow_verifier: self.follow_verifier.clone(),
-            site: self.site(),
+    /// Runs what is not recorded yet, and computes the results of all that is.
+    pub fn run(&self, request: Request) -> Result<Outcome> {
+        let folder = policy_folder(self.policy.as_ref())?;
+        let policy = Vla::load(&folder, self.device)?;
+        let digest = policy.parser().digest().to_owned();
+        let verifier = self.verifier(&folder, &digest)?;
+        self.check(&request, verifier.as_deref())?;
+        let runtime =
+            tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+        let (tasks, deployment) = self.tasks(&runtime)?;
+        let suite = Suite {
+            tasks,
+            episodes: request.episodes,
+            layouts: request.layouts,
+            range: request.range,
+            seed: self.seed,
+        };
+        let options = self.options(&suite, &request.settings);
+        let versions = build_info::versions(&digest, verifier.as_deref().map(Verifier::digest));
+        let run = self.open_run(request.title, options, versions)?;
+        let run_folder = run.folder.clone();
+        let experiment = Experiment {
+            title: request.title.to_owned(),
+            plans: suite.episodes(),
+            settings: request.settings,
+            policy: Arc::new(policy),
+            scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
+            follow_verifier: self.follow_verifier.clone().map(|name| (name, load_scorer(digest))),
             sessions: usize::from(self.sessions),
-            out: self.out.clone(),
-            labels: self.labels.clone(),
-            keep: Keep { all_hidden: self.all_hidden, video: self.video },
+            record: RecordOptions { all_hidden: self.all_hidden, video: self.video },
+            versions: build_info::record_versions(),
+        };
+        let ending = experiment.run(run, &runtime, || match deployment {
+            Some(deployment) => Ok(deployment),
+            None => self.site().open(&runtime, usize::from(self.sessions)),
+        })?;
+        let (results, provenance) = results(&run_folder)?;
+        Ok(Outcome { folder: run_folder, policy: folder, results, provenance, ending })
+    }
+
+    /// The named verifier, or the one beside the policy's weights; none where one is followed and none is named.
+    fn verifier(&self, policy: &Path, digest: &str) -> Result<Option<Arc<Verifier>>> {
+        let beside = policy.join("verifier.safetensors");
+        let is_beside = self.follow_verifier.is_none() && beside.is_file();
+        let path = self.verifier.clone().or_else(|| is_beside.then_some(beside));
+        path.map(|path| Ok(Arc::new(Verifier::load(&path, digest)?))).transpose()
+    }
+
+    /// Wrong usage that can be told before anything is started.
+    fn check(&self, request: &Request, verifier: Option<&Verifier>) -> Result<()> {
+        let needing = request.settings.iter().find(|setting| setting.strategy.needs_verifier());
+        if let (Some(setting), None, None) = (needing, verifier, &self.follow_verifier) {
+            let strategy = setting.strategy;
+            bail!(WrongUsage(format!(
+                "strategy {strategy}: expected a verifier (--verifier FILE), got none"
+            )));
+        }
+        for name in [Some(&self.fleet), self.follow_verifier.as_ref()].into_iter().flatten() {
+            protocol::Keys::new(name).map_err(|error| WrongUsage(error.to_string()))?;
+        }
+        store::check_writable(&self.labels)
+    }
+
+    /// The tasks that were asked for; where none were, those that the servers offer, which must run for that.
+    fn tasks(&self, runtime: &Runtime) -> Result<(Vec<TaskId>, Option<Deployment>)> {
+        if !self.tasks.is_empty() {
+            return Ok((self.tasks.clone(), None));
+        }
+        let deployment = self.site().open(runtime, usize::from(self.sessions))?;
+        let tasks = runtime.block_on(experiment::default_tasks(&deployment))?;
+        Ok((tasks, Some(deployment)))
+    }
+
+    /// Everything that decides the results, by name. Where it runs and how many episodes at once does not.
+    fn options(&self, suite: &Suite, settings: &[Setting]) -> Value {
+        let Suite { tasks, episodes, layouts, range, seed } = suite;
+        json!({
+            "tasks": tasks.iter().map(TaskId::to_string).collect::<Vec<_>>(),
+            "episodes": episodes,
+            "layouts": layouts,
+            "seeds_from": range.first(),
+            "seed": seed,
+            "settings": settings.iter().map(Setting::to_string).collect::<Vec<_>>(),
+            "follow_verifier": self.follow_verifier,
+            // Sums in another order: the same draws, but for the rare one between two tokens.
+            "device": self.device.to_string(),
+            "all_hidden": self.all_hidden,
+            "video": self.video,
         })
+    }
+
+    /// The named run's folder, or one that is named after what decides its results.
+    fn open_run(&self, title: &str, options: Value, versions: Value) -> Result<Run> {
+        let folder = self.out.clone().unwrap_or_else(|| {
+            let digest = Sha256::digest(format!("{options}{versions}"));
+            let short: String = digest.iter().take(4).map(|byte| format!("{byte:02x}")).collect();
+            Path::new("runs").join(format!("{title}-{short}"))
+        });
+        Run::open(&folder, options, versions)
     }
 
     /// Where the servers are.
@@ -106,9 +255,26 @@ impl EpisodesArguments {
             listen: self.listen.clone(),
             fleet: self.fleet.clone(),
             python: self.python.clone(),
-            idle_secs: None,
         }
     }
+}
+
+/// Reads published verifiers for the policy with this digest.
+fn load_scorer(policy: String) -> LoadScorer {
+    Arc::new(move |update| {
+        let verifier = Verifier::from_bytes(&update.weights, &policy)?;
+        Ok(Arc::new(verifier) as Arc<dyn Scorer>)
+    })
+}
+
+/// Results of all that is recorded in a run, and what they were made with.
+fn results(folder: &Path) -> Result<(Results, Value)> {
+    let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
+    let mut provenance = header.versions.clone();
+    let simulator = summaries.first().map(|summary| summary.simulator.as_str());
+    provenance["simulator"] = json!(simulator);
+    let tasks = tasks_in_order(&header.options);
+    Ok((Results::new(&summaries, &run::faults(folder)?, &tasks)?, provenance))
 }
 
 /// The named checkpoint, or the one that comes with the program.

@@ -1,31 +1,29 @@
 //! `rever evaluate`: strategies side by side on the same episodes.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::Args;
-
-use super::episodes::EpisodesArguments;
-use runtime::campaign::Report;
+use decision::{Setting, Strategy};
 use evaluation::result_file::ResultFile;
-use decision::Strategy;
-use decision::Setting;
-use evaluation::suite::{LAYOUTS, Layouts, Suite};
-use store::plan::SeedRange;
+use evaluation::suite::{LAYOUTS, Layouts};
 use evaluation::table;
+use store::plan::SeedRange;
 
-/// Measures strategies on the same paired episodes; started again it goes on where it was.
+use super::episodes::{EpisodesArguments, Outcome, Request};
+
+/// Evaluate strategies on the same paired episodes; the same command resumes.
 #[derive(Debug, Clone, Args)]
 pub struct Arguments {
     #[command(flatten)]
     episodes_arguments: EpisodesArguments,
-    /// greedy, sample, majority, medoid, verifier, worst, verifier+medoid, oracle; separated by commas.
+    /// greedy, sample, first-well-formed, majority, medoid, verifier, worst, verifier+medoid, oracle; separated by commas.
     #[arg(long, value_delimiter = ',', default_value = "greedy,sample,verifier")]
     strategies: Vec<Strategy>,
     /// Episodes of each task.
     #[arg(long, default_value_t = LAYOUTS)]
     episodes: u32,
-    /// The 24 layouts of each task, or random layouts from the held-out range.
+    /// The fixed initial layouts of each task (24 for SIMPLER's), or random ones from the held-out range.
     #[arg(long, value_enum, default_value = "grid")]
     layouts: Layouts,
     /// Candidates per step; several, separated by commas, give success against N.
@@ -34,33 +32,33 @@ pub struct Arguments {
     /// Sampling temperature; several may be given, separated by commas.
     #[arg(long, value_delimiter = ',', default_value = "1", value_parser = temperature)]
     temperature: Vec<f32>,
-    /// Write the results into this file, too.
+    /// Write the results to this file, too.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
 
 /// Runs what is missing, then prints the tables.
 pub fn run(arguments: Arguments) -> Result<()> {
-    let suite = Suite {
-        tasks: arguments.episodes_arguments.tasks.clone(),
+    let Arguments { strategies, temperature, candidates, .. } = &arguments;
+    let request = Request {
+        title: "evaluate",
         episodes: arguments.episodes,
         layouts: arguments.layouts,
         range: SeedRange::Evaluation,
-        seed: arguments.episodes_arguments.seed,
+        settings: Setting::all(strategies, temperature, candidates),
     };
-    let settings = Setting::all(&arguments.strategies, &arguments.temperature, &arguments.candidates);
-    let report = arguments.episodes_arguments.campaign("evaluate", suite, settings)?.run()?;
-    show(&report, arguments.json.as_deref())
+    let outcome = arguments.episodes_arguments.run(request)?;
+    show(&outcome, arguments.json.as_deref())
 }
 
-/// Prints the tables of a report and writes its file; an error when the report is partial.
-pub fn show(report: &Report, json: Option<&std::path::Path>) -> Result<()> {
-    print!("{}", table::text(&report.results));
-    println!("records: {}", report.folder.display());
+/// Prints the tables of an outcome and writes its file; an error when it is partial.
+pub fn show(outcome: &Outcome, json: Option<&Path>) -> Result<()> {
+    print!("{}", table::text(&outcome.results));
+    println!("records: {}", outcome.folder.display());
     if let Some(path) = json {
-        ResultFile::new(&report.results, report.versions.clone()).write(path)?;
+        ResultFile::new(&outcome.results, outcome.provenance.clone()).write(path)?;
     }
-    report.ensure_complete()
+    outcome.ending.ensure_complete(&outcome.folder)
 }
 
 /// A temperature that can be sampled at.

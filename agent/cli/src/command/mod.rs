@@ -10,6 +10,8 @@ mod evaluate;
 mod report;
 mod train;
 
+use std::fmt;
+
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
@@ -17,7 +19,7 @@ use tracing_subscriber::EnvFilter;
 /// Warnings only: progress and results have their own lines.
 const LOG_FILTER_DEFAULT: &str = "warn,zenoh=error,zenoh_transport=error,zenoh_link=error";
 
-/// Robot policies that think aloud, sampled several times per step and chosen by a learned verifier.
+/// Evaluate reasoning robot policies: sample several candidates per step, verify them, execute the best one.
 #[derive(Debug, Parser)]
 #[command(name = "rever", version)]
 pub struct Program {
@@ -58,3 +60,15 @@ pub fn start_log(filter: Option<&str>) {
     let filter = EnvFilter::new(filter.unwrap_or(LOG_FILTER_DEFAULT));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
 }
+
+/// The command line asks for something that there is not; found out before anything was started.
+#[derive(Debug)]
+pub struct WrongUsage(pub String);
+
+impl fmt::Display for WrongUsage {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for WrongUsage {}

@@ -7,7 +7,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::episodes::policy_folder;
-use vla::{DeviceName, Vla};
+use vla::CompletionParser;
 use evaluation::report::{self, Report, ReportOptions, Speech};
 use store::run;
 
@@ -51,7 +51,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
 /// Builds the report of a run with the policy that made it.
 pub fn build(run: &Path, out: &Path, policy: &Path, episodes_max: usize) -> Result<Report> {
     let header = run::read_header(run)?;
-    let policy = Policy::load(policy, DeviceName::Cpu)?;
+    let policy = CompletionParser::load(policy)?;
     let (expected, found) = (header.versions["policy"].as_str(), policy.digest());
     ensure!(
         expected == Some(found),
@@ -59,7 +59,7 @@ pub fn build(run: &Path, out: &Path, policy: &Path, episodes_max: usize) -> Resu
         expected.unwrap_or("an unknown one")
     );
     let speak = |tokens: &[u32]| Speech {
-        text: policy.decode_text(tokens),
+        text: policy.text(tokens),
         reasoning: policy.parse(tokens).ok().map(|parsed| parsed.reasoning),
     };
     let bar = ProgressBar::no_length().with_prefix("report");
