@@ -111,7 +111,9 @@ impl Experiment {
         }
         let planned = self.plans.len() * self.settings.len();
         let given_up = runtime.block_on(queue.given_up())?;
-        let missing = self.missing(&name, &folder)?;
+        // The run may hold settings that this experiment did not ask for.
+        let rest = RunQueue::new(&name, &self.plans, &self.settings, &run::recorded(&folder)?);
+        let missing = runtime.block_on(rest.progress())?.waiting;
         Ok(Ending { missing, planned, given_up, was_stopped })
     }
 
@@ -123,13 +125,6 @@ impl Experiment {
             bail!("strategy {}: expected a verifier (--verifier FILE), got none", setting.strategy);
         }
         Ok(())
-    }
-
-    /// The run may hold settings that this experiment did not ask for.
-    fn missing(&self, name: &str, folder: &Path) -> Result<usize> {
-        let recorded = run::recorded(folder)?;
-        let identities = store::queue::identities(name, &self.plans, &self.settings);
-        Ok(identities.filter(|identity| !recorded.contains(&identity.id())).count())
     }
 
     /// True when somebody stopped it.

@@ -10,7 +10,6 @@ use serde::Serialize;
 use serde_json::Value;
 
 use crate::setup::{self, PythonEnvironment};
-use evaluation::suite::TASKS;
 
 /// One of ours. `Python` and `Native` give the same bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
@@ -62,7 +61,7 @@ impl ServerProgram {
     /// What its `serve` needs to be told beside the common options.
     pub fn serve_arguments(&self) -> Vec<&'static str> {
         match self {
-            ServerProgram::Robosuite(_) => [&["--robosuite"][..], &TASKS].concat(),
+            ServerProgram::Robosuite(_) => vec!["--robosuite", "bridge"],
             ServerProgram::Python(_) | ServerProgram::Native { .. } => Vec::new(),
         }
     }

@@ -1,4 +1,4 @@
-//! How a person ends a run early: Ctrl-C once to finish what runs, twice to drop it.
+//! How a person ends a run early: Ctrl-C once to finish the running episodes, twice to drop them.
 
 use anyhow::{Context, Result};
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -24,6 +24,13 @@ pub fn listen() -> Result<watch::Receiver<Stop>> {
     Ok(receiver)
 }
 
+/// Waits until a run is asked to end this early or earlier; for ever where nobody can ask any more.
+pub async fn asked(mut stop: watch::Receiver<Stop>, at_least: Stop) {
+    if stop.wait_for(|stop| *stop >= at_least).await.is_err() {
+        std::future::pending().await
+    }
+}
+
 async fn forward(mut interrupts: Signal, mut terminations: Signal, stop: watch::Sender<Stop>) {
     while *stop.borrow() != Stop::Now {
         let next = tokio::select! {
@@ -34,7 +41,7 @@ async fn forward(mut interrupts: Signal, mut terminations: Signal, stop: watch::
             _ = terminations.recv() => Stop::Now,
         };
         if next == Stop::Finish {
-            eprintln!("finishing the episodes that run; Ctrl-C again drops them");
+            eprintln!("finishing the episodes that are running; press Ctrl-C again to drop them");
         }
         stop.send_replace(next);
     }

@@ -3,9 +3,10 @@
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
+use decision::TaskId;
 use serde::Serialize;
 
-use super::wire::{EPISODE_STEPS, WARM_UP_STEPS, at_once, circling, open, reset};
+use super::wire::{EPISODE_STEPS, WARM_UP_STEPS, at_once, circling, default_tasks, open, reset};
 use evaluation::statistics::quantile;
 use runtime::servers::LocalServers;
 use runtime::simulator::{ServerProgram, Simulator};
@@ -74,18 +75,19 @@ impl SimulatorsBench<'_> {
         network.servers(servers.len(), SERVERS_WAIT).await;
         let mut rows = Vec::new();
         for side in [SIDE_NONE, self.side] {
-            let mut both = Vec::new();
+            let (mut both, mut tasks) = (Vec::new(), Vec::new());
             for server in servers {
                 let id = server.server_ids().pop().context("a local server is not ready")?;
+                tasks = default_tasks(network, &id).await?;
                 let mut environments = Vec::new();
                 for index in 0..most {
-                    environments.push(open(network, &id, side, index).await?);
+                    environments.push(open(network, &id, &tasks, side, index).await?);
                 }
                 both.push(environments);
             }
             for &sessions in self.sessions {
                 let rests: Vec<_> = both.iter_mut().map(|all| all.split_off(sessions)).collect();
-                let (row, used) = self.count(side, both).await?;
+                let (row, used) = self.count(side, both, &tasks).await?;
                 rows.push(row);
                 both = used;
                 both.iter_mut().zip(rests).for_each(|(all, rest)| all.extend(rest));
@@ -101,11 +103,12 @@ impl SimulatorsBench<'_> {
         &self,
         side: u32,
         both: Vec<Vec<Environment>>,
+        tasks: &[TaskId],
     ) -> Result<(Row, Vec<Vec<Environment>>)> {
         let sessions = both[0].len();
         let mut episodes = Vec::new();
         for environments in both {
-            episodes.push(reset(environments).await?);
+            episodes.push(reset(environments, tasks).await?);
         }
         let mut times = vec![Vec::new(); episodes.len()];
         for index in 0..WARM_UP_STEPS + self.steps {
@@ -113,10 +116,10 @@ impl SimulatorsBench<'_> {
             let mut after = Vec::new();
             for (mut own, times) in episodes.into_iter().zip(&mut times) {
                 if is_over {
-                    own = reset(own.into_iter().map(Episode::finish).collect()).await?;
+                    own = reset(own.into_iter().map(Episode::finish).collect(), tasks).await?;
                 }
                 let (step_ms, own) = at_once(own, |mut episode: Episode| async move {
-                    episode.step(circling(index)).await.map(|_| episode)
+                    episode.step(&circling(index)).await.map(|_| episode)
                 })
                 .await?;
                 if index >= WARM_UP_STEPS {

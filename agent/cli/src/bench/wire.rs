@@ -13,6 +13,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
+use decision::{TaskId, VARIANT_DEFAULT};
 use protocol::{Open, PROTOCOL_VERSION, Reset};
 use serde::Serialize;
 use tokio::task::JoinSet;
@@ -91,14 +92,15 @@ impl WireBench<'_> {
     async fn rows(&self, network: &Network, most: usize) -> Result<Vec<Row>> {
         let found = network.servers(1, SERVER_WAIT).await.servers;
         let server = found.keys().next().context("the local server was not found")?;
+        let tasks = default_tasks(network, server).await?;
         let mut environments = Vec::new();
         for index in 0..most {
-            environments.push(open(network, server, self.side, index).await?);
+            environments.push(open(network, server, &tasks, self.side, index).await?);
         }
         let mut rows = Vec::new();
         for &sessions in self.sessions {
             let rest = environments.split_off(sessions);
-            let (row, used) = self.count(environments).await?;
+            let (row, used) = self.count(environments, &tasks).await?;
             rows.push(row);
             environments = used;
             environments.extend(rest);
@@ -107,18 +109,22 @@ impl WireBench<'_> {
     }
 
     /// Steps and repetitions of these sessions in turns.
-    async fn count(&self, environments: Vec<Environment>) -> Result<(Row, Vec<Environment>)> {
+    async fn count(
+        &self,
+        environments: Vec<Environment>,
+        tasks: &[TaskId],
+    ) -> Result<(Row, Vec<Environment>)> {
         let sessions = environments.len();
         let mut socket = BareSocket::open().context("cannot open a socket")?;
         let [mut stepped, mut simulated, mut wire, mut repeated, mut sizes, mut bare] =
             [const { Vec::new() }; 6];
-        let mut episodes = reset(environments).await?;
+        let mut episodes = reset(environments, tasks).await?;
         for index in 0..WARM_UP_STEPS + self.steps {
             if index % EPISODE_STEPS == EPISODE_STEPS - 1 {
-                episodes = reset(episodes.into_iter().map(Episode::finish).collect()).await?;
+                episodes = reset(episodes.into_iter().map(Episode::finish).collect(), tasks).await?;
             }
             let (step_ms, after) = at_once(episodes, |mut episode: Episode| async move {
-                episode.step(circling(index)).await.map(|_| episode)
+                episode.step(&circling(index)).await.map(|_| episode)
             })
             .await?;
             let in_simulator = after.iter().map(Episode::simulator_time).sum::<Duration>();
@@ -202,17 +208,28 @@ impl BareSocket {
     }
 }
 
+/// The tasks of a server in their default variant, in the order of its description.
+pub(super) async fn default_tasks(network: &Network, server: &str) -> Result<Vec<TaskId>> {
+    let description = network.describe(server).await?;
+    let tasks = description.tasks.iter().map(|offer| TaskId::new(&offer.task, &offer.variant));
+    let tasks: Vec<TaskId> = tasks.filter(|task| task.variant == VARIANT_DEFAULT).collect();
+    ensure!(!tasks.is_empty(), "server {server}: expected a task in its default variant, got none");
+    Ok(tasks)
+}
+
 /// A session of the task that comes at this place.
 pub(super) async fn open(
     network: &Network,
     server: &str,
+    tasks: &[TaskId],
     side: u32,
     index: usize,
 ) -> Result<Environment> {
+    let task = &tasks[index % tasks.len()];
     let open = Open {
         protocol: PROTOCOL_VERSION,
-        task: TASKS[index % TASKS.len()].to_owned(),
-        variant: VARIANT_DEFAULT.to_owned(),
+        task: task.task.clone(),
+        variant: task.variant.clone(),
         image_height: side,
         image_width: side,
         expert: false,
@@ -222,11 +239,15 @@ pub(super) async fn open(
 }
 
 /// Begins an episode in every session.
-pub(super) async fn reset(environments: Vec<Environment>) -> Result<Vec<Episode>> {
+pub(super) async fn reset(
+    environments: Vec<Environment>,
+    tasks: &[TaskId],
+) -> Result<Vec<Episode>> {
     let begin = |(index, environment): (usize, Environment)| {
+        let task = &tasks[index % tasks.len()];
         let reset = Reset {
-            task: TASKS[index % TASKS.len()].to_owned(),
-            variant: VARIANT_DEFAULT.to_owned(),
+            task: task.task.clone(),
+            variant: task.variant.clone(),
             layout: None,
             seed: SeedRange::Tuning.first() + index as u64,
         };

@@ -27,7 +27,7 @@ use tokio::task::JoinSet;
 use crate::fault::AttemptFault;
 use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 use crate::sinks::{Event, Sinks};
-use crate::stop::Stop;
+use crate::stop::{Stop, asked};
 use batcher::DecisionBatcher;
 use episode::EpisodeRun;
 
@@ -65,7 +65,7 @@ pub struct Rollout<P> {
 impl<P: SessionPool> Rollout<P> {
     /// Runs the queue to its end, or until it is stopped. What was recorded is durable when this returns.
     pub async fn run(self) -> Result<()> {
-        let mut stop = self.stop.clone();
+        let stop = self.stop.clone();
         let sessions = self.sessions;
         let active = Arc::new(AtomicUsize::new(0));
         let batcher = DecisionBatcher::start(Arc::clone(&self.decider), Arc::clone(&active));
@@ -89,8 +89,7 @@ impl<P: SessionPool> Rollout<P> {
         };
         let result = tokio::select! {
             result = finished => result,
-            // An error says that nobody can stop it any more, so it is no reason to stop.
-            Ok(_) = stop.wait_for(|stop| *stop == Stop::Now) => Ok(()),
+            () = asked(stop, Stop::Now) => Ok(()),
         };
         workers.shutdown().await;
         let shared = Arc::into_inner(shared).context("a worker outlived the rollout")?;
@@ -148,10 +147,10 @@ impl<P: SessionPool> Shared<P> {
             task: lease.job.identity.task_id(),
             needs_expert: lease.job.setting.strategy.needs_expert(),
         };
-        let mut stop = self.rollout.stop.clone();
+        let stop = self.rollout.stop.clone();
         let session = tokio::select! {
             session = pool.acquire(&request) => session?,
-            Ok(_) = stop.wait_for(|stop| *stop != Stop::No) => return queue.release(lease).await,
+            () = asked(stop, Stop::Finish) => return queue.release(lease).await,
         };
         let info = session.info.clone();
         match self.attempt(&lease, session).await {
