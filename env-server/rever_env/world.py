@@ -78,7 +78,7 @@ class Transition:
 
 
 class World:
-    """One task in MuJoCo with its camera. Not thread-safe: use it in the thread that made it."""
+    """One task in MuJoCo with its camera. Any thread may use it, one at a time."""
 
     def __init__(self, task: Task, image_height: int = 128, image_width: int = 128) -> None:
         silence_warnings()
