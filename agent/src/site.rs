@@ -23,8 +23,6 @@ pub struct Site {
     pub listen: Vec<String>,
     /// Who meets whom.
     pub fleet: String,
-    /// Sessions without requests end after that, on servers started here; none takes the servers' own limit.
-    pub idle_secs: Option<u32>,
     /// A Python that has the packages already, instead of the one that is set up.
     pub python: Option<PathBuf>,
 }
@@ -91,7 +89,6 @@ impl Site {
             fleet: self.fleet.clone(),
             // Each could serve all of them, should the others die.
             sessions_each: sessions,
-            idle_secs: self.idle_secs,
         };
         LocalServers::start(program, &options)
     }

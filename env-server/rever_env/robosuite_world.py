@@ -49,6 +49,7 @@ class RobosuiteTask:
     state: tuple[Dimension, ...]
     action: tuple[Dimension, ...]
     making: Mapping[str, Any]  # for robosuite.make
+    control_hz: float
     camera: str = "agentview"
     version: int = 1
     layouts: tuple[Any, ...] = ()  # robosuite draws every layout of its own tasks
@@ -122,6 +123,7 @@ def _task(name: str, robot: str, steps_max: int, making: Mapping[str, Any]) -> R
         state,
         action,
         making,
+        float(making["control_freq"]),
         is_one_arm=is_one_arm,
     )
 
@@ -147,6 +149,7 @@ def _bridge(task: tasks.Task) -> RobosuiteTask:
         task.state,
         task.action,
         {"env_name": robosuite_bridge.ENVIRONMENTS[task.name]},
+        task.control_hz,
         robosuite_bridge.CAMERA,
         task.version,
         task.layouts,

@@ -282,9 +282,7 @@ def divergence(data: mujoco.MjData) -> list[str]:
     return [name for index, name in _DIVERGENCE.items() if counts[index] > 0]
 
 
-def place_objects(
-    model: mujoco.MjModel, data: mujoco.MjData, task: Task, layout: Layout
-) -> None:
+def place_objects(model: mujoco.MjModel, data: mujoco.MjData, task: Task, layout: Layout) -> None:
     """Puts source and target above where they will rest."""
     rows = [(task.source, layout.source_x, layout.source_y, task.source_height)]
     yaws = [layout.source_yaw]

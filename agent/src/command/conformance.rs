@@ -34,8 +34,6 @@ pub struct Arguments {
 
 /// Sessions of a server that is started here: few, so that all of them can be opened.
 const SESSIONS: usize = 4;
-/// Its idle limit: longer than a session may be without a holder, short enough to be waited for.
-const IDLE_SECS: u32 = 12;
 
 /// Prints each row when it is done; an error when one fails.
 pub fn run(arguments: Arguments) -> Result<()> {
@@ -47,7 +45,6 @@ pub fn run(arguments: Arguments) -> Result<()> {
         simulator: arguments.server.unwrap_or_default(),
         connect: arguments.connect,
         fleet: arguments.fleet,
-        idle_secs: Some(IDLE_SECS),
         python: arguments.python,
         ..Site::default()
     };

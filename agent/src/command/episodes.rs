@@ -105,7 +105,6 @@ impl EpisodesArguments {
             listen: self.listen.clone(),
             fleet: self.fleet.clone(),
             python: self.python.clone(),
-            idle_secs: None,
         }
     }
 }

@@ -285,6 +285,7 @@ mod tests {
             version,
             instruction: String::new(),
             steps_max: 1,
+            control_hz: None,
             layouts: 0,
             state: Vec::new(),
             action: Vec::new(),
@@ -299,7 +300,6 @@ mod tests {
             sessions: 0,
             sessions_max: 1,
             slots_max: 1,
-            idle_secs_max: 1,
         }
     }
 

@@ -31,8 +31,6 @@ pub struct LocalServerOptions {
     pub fleet: String,
     /// How many sessions each process serves.
     pub sessions_each: usize,
-    /// A session without requests ends after that; none takes the servers' own limit.
-    pub idle_secs: Option<u32>,
 }
 
 /// Running servers; dropping them kills the processes.
@@ -255,9 +253,6 @@ impl Supervisor {
             .args(["--exit-with-parent", &parent.to_string()])
             .args(["--sessions", &sessions.to_string()])
             .args(["--connect", &self.options.connect, "--fleet", &self.options.fleet]);
-        if let Some(seconds) = self.options.idle_secs {
-            command.args(["--idle-secs", &seconds.to_string()]);
-        }
         let lines = self.events.clone();
         let closed = self.events.clone();
         ServerProcess::spawn(
