@@ -217,13 +217,13 @@ def _worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
     from rever_env.worlds import Worlds
 
     if arguments.robosuite:
-        from rever_env import robosuite_world
+        from rever_env import robosuite_tasks, robosuite_world
 
-        offered = robosuite_world.offered(
+        offered = robosuite_tasks.offered(
             arguments.robosuite, arguments.robots, arguments.horizon, arguments.control_hz
         )
         return Worlds(
-            offered, idle_max, robosuite_world.RobosuiteWorld, robosuite_world.simulator()
+            offered, idle_max, robosuite_world.RobosuiteWorld, robosuite_tasks.simulator()
         )
     if arguments.gymnasium:
         return _gymnasium_worlds(arguments, idle_max)
