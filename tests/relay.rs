@@ -75,12 +75,12 @@ impl Relay {
             arrived: AtomicUsize::new(0),
             tokens: Mutex::default(),
         });
-        wire.carry("rever/2/agents/session/*/request", true).await;
-        wire.carry("rever/2/servers/session/*/reply", true).await;
-        wire.carry("rever/2/servers/server/*/heartbeat", false).await;
-        wire.mirror("rever/2/servers/server/*").await;
-        wire.mirror("rever/2/agents/session/*").await;
-        wire.ask("rever/2/agents/server/*/*").await;
+        wire.carry("rever/3/agents/session/*/request", true).await;
+        wire.carry("rever/3/servers/session/*/reply", true).await;
+        wire.carry("rever/3/servers/server/*/heartbeat", false).await;
+        wire.mirror("rever/3/servers/server/*").await;
+        wire.mirror("rever/3/agents/session/*").await;
+        wire.ask("rever/3/agents/server/*/*").await;
         Self { session, wire }
     }
 

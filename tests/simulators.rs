@@ -40,7 +40,7 @@ const BROKEN: [(&str, &[&str]); 7] = [
         &["seeds", "sessions_max", "simulator_time", "save"],
     ),
     ("forgets_close,any_length,changes_world_first", &["sessions_max", "dimensions", "reset_task"]),
-    ("keeps_leases", &["holder_gone", "holder_missing", "idle"]),
+    ("keeps_leases", &["holder_gone", "holder_missing"]),
 ];
 
 /// Built once.
@@ -93,16 +93,7 @@ fn wild_actions_are_equal_bit_for_bit() {
     std::fs::write(&file, actions).expect("written");
     let file = file.to_str().expect("a readable path");
     for task in TASKS {
-        assert_equal_traces(&[
-            "--task",
-            task,
-            "--layout",
-            "7",
-            "--side",
-            "224",
-            "--actions",
-            file,
-        ]);
+        assert_equal_traces(&["--task", task, "--layout", "7", "--side", "224", "--actions", file]);
     }
 }
 
@@ -175,7 +166,7 @@ fn conformance_of(command: &mut Command) -> (BTreeSet<String>, usize, String) {
 fn serving<T>(command: &mut Command, act: impl FnOnce(&str) -> T) -> T {
     let endpoint = free_endpoint();
     let mut server = command
-        .args(["--sessions", "4", "--idle-secs", "12"])
+        .args(["--sessions", "4"])
         .args(["--exit-with-parent", "--listen", &endpoint])
         .stdin(Stdio::null())
         .stdout(Stdio::null())

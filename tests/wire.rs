@@ -210,19 +210,6 @@ async fn a_session_dies_with_its_holder() {
     Environment::open(&network, &server.id, open()).await.expect("the session is free again");
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn an_idle_session_ends_and_says_so() {
-    let (network, server) = network_with_server("idle", &["--idle-secs", "1"]).await;
-    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
-    let mut episode = environment.reset(spoon()).await.expect("an episode");
-    assert_eq!(sessions_become(&network, 0).await, 0, "the session does not end");
-    let fault = episode.step([0.0; 7]).await.expect_err("the session has ended");
-    let EnvironmentFault::Refused { reason } = &fault else {
-        panic!("expected a refusal, got {fault:?}")
-    };
-    assert!(reason.ends_with("ended: no request came for 1 s"), "{reason}");
-}
-
 /// Asks until the server has that many sessions in use; returns what it had last.
 async fn sessions_become(network: &Network, expected: u32) -> u32 {
     let deadline = Instant::now() + WAIT;
@@ -276,7 +263,7 @@ async fn what_no_client_of_ours_would_send_is_refused_in_words() {
             .expect("the golden file is there")
     };
     let replies = stranger
-        .declare_subscriber(format!("rever/2/strange/session/{session}/reply"))
+        .declare_subscriber(format!("rever/3/strange/session/{session}/reply"))
         .await
         .expect("a subscriber");
     for (request, sequence, words) in [
@@ -290,7 +277,7 @@ async fn what_no_client_of_ours_would_send_is_refused_in_words() {
         (golden("request_restore.msgpack"), 70_000, "sequence: expected 3, got 70000"),
     ] {
         stranger
-            .put(format!("rever/2/strange/session/{session}/request"), request)
+            .put(format!("rever/3/strange/session/{session}/request"), request)
             .await
             .expect("sent");
         let sample = tokio::time::timeout(WAIT, replies.recv_async())
@@ -310,7 +297,7 @@ async fn what_no_client_of_ours_would_send_is_refused_in_words() {
         ),
         (vec![0xc0; 1025], "open has 1025 bytes, limit 1024"),
     ] {
-        let key = format!("rever/2/strange/server/{}/open", server.id);
+        let key = format!("rever/3/strange/server/{}/open", server.id);
         let answers = stranger.get(key).payload(payload).timeout(WAIT).await.expect("asked");
         let sample =
             answers.recv_async().await.expect("an answer").into_result().expect("a sample");

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 __all__ = ["RemoteEnv", "RemoteVectorEnv"]
 
-# MuJoCo reads its OpenGL backend from the environment when it is first imported.
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+# Importing MuJoCo with its default backend needs a display. The worlds make their own contexts.
+_HAS_DISPLAY = bool(os.environ.get("DISPLAY"))
+_CAN_USE_EGL = os.environ.get("PYOPENGL_PLATFORM", "egl") == "egl"
+if sys.platform == "linux" and _CAN_USE_EGL and not _HAS_DISPLAY:
     os.environ.setdefault("MUJOCO_GL", "egl")
 # Mesa's software renderer draws in the thread that asks: handing a small picture to threads of its
 # own takes as long as drawing it, servers share a machine by processes, and threads do not live on

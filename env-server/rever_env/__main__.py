@@ -34,6 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     expert.add_argument("--episodes", type=int, default=200, help="random layouts per task")
     expert.add_argument("--seed", type=int, default=4_000_000_000)
     expert.add_argument("--processes", type=int, default=2)
+    expert.add_argument("--robosuite", action="store_true", help="in robosuite")
     expert.set_defaults(run=_expert)
 
     demonstrate = commands.add_parser("demonstrate", help="record expert episodes for training")
@@ -126,6 +127,7 @@ def _expert(arguments: argparse.Namespace) -> int:
         arguments.seed,
         processes=arguments.processes,
         report=lambda line: print(line, file=sys.stderr, flush=True),
+        in_robosuite=arguments.robosuite,
     )
     print(measurement.table(rows))
     return 0

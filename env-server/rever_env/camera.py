@@ -1,7 +1,9 @@
 """The camera: RGB images and visible-pixel masks from an offscreen OpenGL context."""
 
-import os
+import sys
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
 
@@ -9,18 +11,21 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rever_env import opengl
 from rever_env.fault import RendererUnavailable
 
 Image = NDArray[np.uint8]
 _GEOMS_MAX = 200
 _HIDDEN_GROUP = 5  # of shapes; MuJoCo draws the groups 0 to 2
+_HAS_EGL = sys.platform == "linux"
 _EDGE_MARGIN = 1e-3  # metres, for what is rounded on the way to a pixel
 
 
 class Camera:
     """Renders one fixed camera; the model, not the image's shape, sets its field of view.
 
-    With 0 x 0 pixels it renders nothing, and needs no OpenGL.
+    With 0 x 0 pixels it renders nothing, and needs no OpenGL. Any thread may use it, one at a time:
+    its OpenGL context is current only while it draws.
     """
 
     def __init__(self, model: mujoco.MjModel, name: str, height: int, width: int) -> None:
@@ -35,19 +40,20 @@ class Camera:
 
     def _open(self, model: mujoco.MjModel, height: int, width: int) -> None:
         try:
-            self._context: Any = mujoco.GLContext(width, height)
-            self._context.make_current()
-            self._renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+            context = opengl.Context() if _HAS_EGL else _PlatformContext(height, width)
+            with context.current():
+                renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+                mujoco.mjr_resizeOffscreen(width, height, renderer)
+                mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
         except Exception as error:  # the binding raises whatever its backend raises
             raise RendererUnavailable(
                 f"renderer for {height} x {width} images: expected an offscreen OpenGL context, "
-                f"got {type(error).__name__}: {error} (MUJOCO_GL, which is read when mujoco is "
-                f"first imported, is {os.environ.get('MUJOCO_GL')!r})"
+                f"got {error}"
             ) from error
-        # Freed at the latest before the interpreter ends, while the display still exists.
-        self._release = weakref.finalize(self, _release, self._context, self._renderer)
-        mujoco.mjr_resizeOffscreen(width, height, self._renderer)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._renderer)
+        self._context, self._renderer = context, renderer
+        self._release = weakref.finalize(self, _release, context, renderer)
+        # A context goes with its process: MuJoCo may have closed the display before.
+        self._release.atexit = False
         self._scene = mujoco.MjvScene(model, maxgeom=_GEOMS_MAX)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = 0
@@ -63,16 +69,18 @@ class Camera:
         """RGB, uint8 (height, width, 3)."""
         if self._height == 0:
             return np.empty((0, 0, 3), np.uint8)
-        self._update(data)
-        return self._read()
+        with self._context.current():
+            self._update(data)
+            return self._read()
 
     def bodies(self, data: mujoco.MjData) -> NDArray[np.int32]:
         """Body id seen at each pixel, int32 (height, width); -1 where the background is."""
-        self._update(data)
         flags = self._scene.flags
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
-        flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
-        pixels = self._read().astype(np.int32)
+        with self._context.current():
+            self._update(data)
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
+            flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
+            pixels = self._read().astype(np.int32)
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 0
         flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
         # Colour 0 is the background, colour k + 1 the scene's geom with segmentation id k.
@@ -111,8 +119,6 @@ class Camera:
         self.close()
 
     def _update(self, data: mujoco.MjData) -> None:
-        # Several worlds may live in one process: each makes its own context current first.
-        self._context.make_current()
         self._hide(data)
         mujoco.mjv_updateScene(
             self._model,
@@ -125,7 +131,7 @@ class Camera:
         )
 
     def _hide(self, data: mujoco.MjData) -> None:
-        """Takes shapes beyond the picture's edges out: no pixel changes, and OpenGL's work does."""
+        """Hides shapes outside the image, which OpenGL would process without changing a pixel."""
         index = self._view.fixedcamid
         normals = data.cam_xmat[index].reshape(3, 3) @ self._edges
         beyond = (data.geom_xpos - data.cam_xpos[index]) @ normals  # (shapes, 5), metres
@@ -158,7 +164,22 @@ def _edges(model: mujoco.MjModel, camera: int) -> NDArray[np.float64]:
     return normals
 
 
-def _release(context: Any, renderer: mujoco.MjrContext) -> None:
-    context.make_current()
-    renderer.free()
+class _PlatformContext:
+    """MuJoCo's own context, for systems without EGL."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self._context: Any = mujoco.GLContext(width, height)
+
+    @contextmanager
+    def current(self) -> Iterator[None]:
+        self._context.make_current()
+        yield
+
+    def free(self) -> None:
+        self._context.free()
+
+
+def _release(context: opengl.Context | _PlatformContext, renderer: mujoco.MjrContext) -> None:
+    with context.current():
+        renderer.free()
     context.free()

@@ -1,6 +1,7 @@
 """Any Gymnasium environment behind the protocol, by its id."""
 
 import importlib
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -60,6 +61,7 @@ class GymnasiumTask:
     shows_itself: bool  # a picture is in the observation
     renders: bool
     making: Making
+    control_hz: float | None  # render_fps of its metadata
     variant: str = "default"
     version: int = 1
     layouts: tuple[()] = ()  # the seed draws every start
@@ -298,9 +300,17 @@ def _task(name: str, making: Making, horizon: int) -> GymnasiumTask:
             bool(images_of(environment.observation_space, None)),
             "rgb_array" in environment.metadata.get("render_modes", []),
             making,
+            _control_hz(environment.metadata.get("render_fps")),
         )
     finally:
         environment.close()
+
+
+def _control_hz(render_fps: object) -> float | None:
+    """What the metadata say, if it is a rate."""
+    if isinstance(render_fps, (int, float)) and 0.0 < render_fps < math.inf:
+        return float(render_fps)
+    return None
 
 
 def _make(task: GymnasiumTask, size: tuple[int, int]) -> "gymnasium.Env[Any, Any]":

@@ -40,9 +40,7 @@ def place(task: Task, layout: int | None, seed: int) -> Layout:
 def check_layout(task: str, layout: int | None, count: int) -> None:
     """InvalidReset for a layout beyond the task's count; None is a random layout."""
     if layout is not None and not 0 <= layout < count:
-        raise InvalidReset(
-            f"layout {layout}: expected 0 <= layout < {count} for task {task}"
-        )
+        raise InvalidReset(f"layout {layout}: expected 0 <= layout < {count} for task {task}")
 
 
 def near_grid_layout(task: Task, layout: Layout) -> bool:
@@ -55,8 +53,7 @@ def near_grid_layout(task: Task, layout: Layout) -> bool:
             layout.source_y - grid.source_y,
         )
         <= radius
-        and _distance(layout.target_x - grid.target_x, layout.target_y - grid.target_y)
-        <= radius
+        and _distance(layout.target_x - grid.target_x, layout.target_y - grid.target_y) <= radius
         and _turn(layout.source_yaw - grid.source_yaw) <= ranges.exclusion_yaw
         for grid in task.layouts
     )
@@ -73,14 +70,10 @@ def _draw(task: Task, seed: int) -> Layout:
             target_x=generator.uniform(*ranges.target_x),
             target_y=generator.uniform(*ranges.target_y),
         )
-        apart = _distance(
-            layout.source_x - layout.target_x, layout.source_y - layout.target_y
-        )
+        apart = _distance(layout.source_x - layout.target_x, layout.source_y - layout.target_y)
         if apart >= ranges.separation_min and not near_grid_layout(task, layout):
             return layout
-    raise InvalidReset(
-        f"task {task.name}, seed {seed}: no free layout in {_DRAWS_MAX} draws"
-    )
+    raise InvalidReset(f"task {task.name}, seed {seed}: no free layout in {_DRAWS_MAX} draws")
 
 
 def _fnv1a(text: str) -> int:

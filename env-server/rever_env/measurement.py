@@ -6,10 +6,14 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
+from typing import TYPE_CHECKING
 
 from rever_env.demonstrations import Noise
 from rever_env.tasks import Task
 from rever_env.world import World
+
+if TYPE_CHECKING:
+    from rever_env.robosuite_world import RobosuiteWorld
 
 _CHUNK = 10  # episodes per unit of work
 
@@ -22,6 +26,7 @@ class Chunk:
     suite: str  # "grid", "random" or "random, noise"
     layouts: tuple[int | None, ...]
     seeds: tuple[int, ...]
+    in_robosuite: bool = False
 
 
 @dataclass
@@ -49,16 +54,17 @@ def measure(
     *,
     processes: int,
     report: Callable[[str], None],
+    in_robosuite: bool = False,
 ) -> list[Row]:
     """All 24 layouts, and random layouts with and without noise."""
     chunks: list[Chunk] = []
     for task in tasks:
         grid = tuple(range(len(task.layouts)))
-        chunks.append(Chunk(task, "grid", grid, (0,) * len(grid)))
+        chunks.append(Chunk(task, "grid", grid, (0,) * len(grid), in_robosuite))
         for suite in ("random", "random, noise"):
             for start in range(0, episodes, _CHUNK):
                 seeds = tuple(range(seed + start, seed + min(start + _CHUNK, episodes)))
-                chunks.append(Chunk(task, suite, (None,) * len(seeds), seeds))
+                chunks.append(Chunk(task, suite, (None,) * len(seeds), seeds, in_robosuite))
     rows: dict[tuple[str, str], Row] = {}
     for chunk in chunks:
         key = chunk.task.name, chunk.suite
@@ -80,13 +86,25 @@ def measure(
 def run(chunk: Chunk) -> Row:
     """The episodes of one chunk; each runs to its horizon, as SIMPLER's last-step rule asks."""
     row = Row(chunk.task.name, chunk.suite)
-    # The images are not looked at: a tiny one keeps rendering cheap.
-    with World(chunk.task, image_height=8, image_width=8) as world:
+    world = _world(chunk)
+    try:
         started = time.perf_counter()
         for layout, seed in zip(chunk.layouts, chunk.seeds, strict=True):
             _episode(world, chunk, layout, seed, row)
         row.seconds = time.perf_counter() - started
+    finally:
+        world.close()
     return row
+
+
+def _world(chunk: Chunk) -> "World | RobosuiteWorld":
+    if not chunk.in_robosuite:
+        # The images are not looked at: a tiny one keeps rendering cheap.
+        return World(chunk.task, image_height=8, image_width=8)
+    from rever_env.robosuite_tasks import bridge_task
+    from rever_env.robosuite_world import RobosuiteWorld
+
+    return RobosuiteWorld(bridge_task(chunk.task), 0, 0)
 
 
 def table(rows: list[Row]) -> str:
@@ -115,7 +133,7 @@ def table(rows: list[Row]) -> str:
         for line in lines
     ]
     milliseconds = 1e3 * sum(row.seconds for row in rows) / max(sum(row.steps for row in rows), 1)
-    return "\n".join([*text, f"{milliseconds:.2f} ms per control step with expert, tiny images"])
+    return "\n".join([*text, f"{milliseconds:.2f} ms per control step with the expert"])
 
 
 def wilson(successes: int, episodes: int) -> tuple[float, float]:
@@ -130,19 +148,23 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     return max((centre - spread) / scale, 0.0), min((centre + spread) / scale, 1.0)
 
 
-def _episode(world: World, chunk: Chunk, layout: int | None, seed: int, row: Row) -> None:
+def _episode(
+    world: "World | RobosuiteWorld", chunk: Chunk, layout: int | None, seed: int, row: Row
+) -> None:
     world.reset(layout=layout, seed=seed)
+    steps = 0
     noise = Noise(seed, chunk.task) if chunk.suite == "random, noise" else None
     released_at = None
     while True:
         decision = world.expert_decision()
         transition = world.step(noise.apply(decision) if noise else decision.action)
-        row.steps += 1
+        steps += 1
         if transition.statistics.released_success and released_at is None:
-            released_at = world.steps
+            released_at = steps
         if transition.truncated:
             break
     row.episodes += 1
+    row.steps += steps
     row.successes += transition.statistics.is_success
     row.released += transition.statistics.released_success
     row.grasped += transition.statistics.ever_grasped

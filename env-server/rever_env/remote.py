@@ -118,9 +118,7 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         layout, task = layout_of(options), self.session.task
         self._seed = int(self.np_random.integers(RANDOM_SEEDS)) if seed is None else seed
         self.session.send(
-            lambda sequence: protocol.Reset(
-                sequence, task.task, task.variant, layout, self._seed
-            )
+            lambda sequence: protocol.Reset(sequence, task.task, task.variant, layout, self._seed)
         )
 
     def receive_reset(self) -> tuple[Fields, Fields]:

@@ -7,7 +7,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
 from robosuite.models.tasks import ManipulationTask
 
@@ -15,6 +14,7 @@ from rever_env import expert, tasks
 from rever_env.layout import SEED_LIMIT, place
 from rever_env.protocol import Statistics
 from rever_env.robosuite_models import WidowX, bridge_arena, fit_scene
+from rever_env.robosuite_motion import is_moved_by_pose, move_commanded_pose
 from rever_env.success import Judge, Memory
 from rever_env.tasks import Layout, Task
 from rever_env.world import place_objects
@@ -29,24 +29,13 @@ _CONTROLLER = {
     "body_parts": {
         "right": {
             "type": "OSC_POSE",
-            "input_max": 1,
-            "input_min": -1,
+            "input_type": "delta",
+            "input_ref_frame": "base",
             "output_max": [_MOVE_MAX] * 3 + [_TURN_MAX] * 3,
             "output_min": [-_MOVE_MAX] * 3 + [-_TURN_MAX] * 3,
             "kp": 600,
             "damping_ratio": 1,
-            "impedance_mode": "fixed",
-            "kp_limits": [0, 1000],
-            "damping_ratio_limits": [0, 10],
-            "position_limits": None,
-            "orientation_limits": None,
-            "uncouple_pos_ori": True,
-            "input_type": "delta",
-            "input_ref_frame": "base",
-            # A delta moves the goal, not the measured pose, as in SIMPLER.
-            "goal_update_mode": "desired",
             "interpolation": None,
-            "ramp_ratio": 0.2,
             "gripper": {"type": "GRIP"},
         }
     },
@@ -81,7 +70,7 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         self.task = _renamed(tasks.load()[self.task_name])
         self._placement: Layout | None = None
         self.memory: Memory | None = None
-        arguments.setdefault("control_freq", 5)
+        arguments.setdefault("control_freq", self.task.control_hz)
         arguments.setdefault("camera_names", CAMERA)
         arguments.setdefault("render_camera", CAMERA)
         arguments.setdefault("initialization_noise", None)
@@ -107,11 +96,11 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         assert self.memory is not None, "an episode has begun"
         return self.judge.judge(self._data(), self.memory)
 
-    def expert_action(self) -> NDArray[np.float64]:
-        """The scripted expert's action here, float64 (7,) as in the Bridge tasks."""
+    def expert_decision(self) -> expert.Decision:
+        """The scripted expert's action float64 (7,) as in the Bridge tasks, and its reason."""
         assert self.memory is not None, "an episode has begun"
         stage = _Stage(self.sim.model._model, self._data(), self.task, self.judge, self.memory)
-        return expert.decide(self.task, expert.look(stage)).action
+        return expert.decide(self.task, expert.look(stage))
 
     def _data(self) -> mujoco.MjData:
         """MuJoCo's own, for the rules of the task."""
@@ -148,6 +137,10 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         place_objects(model, data, self.task, layout)
         self._settle(model, data)
         self.memory = self.judge.begin(data)
+        (robot,) = self.robots
+        if is_moved_by_pose(robot):
+            # As in SIMPLER.
+            move_commanded_pose(robot)
 
     def _settle(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Lets the objects come to rest while the robot, which nobody controls yet, is held."""

@@ -1,196 +1,66 @@
-"""robosuite's environments behind the protocol: any of its tasks with any of its robots."""
+"""robosuite's environments behind the protocol."""
 
 import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib import metadata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rever_env import tasks
-from rever_env.fault import InvalidAction, InvalidReset, PhysicsDiverged
+from rever_env import opengl
+from rever_env.expert import Decision
+from rever_env.fault import InvalidAction, PhysicsDiverged, RendererUnavailable
 from rever_env.layout import check_layout
 from rever_env.pose import in_base
-from rever_env.protocol import Dimension, Statistics
+from rever_env.protocol import Statistics
+from rever_env.robosuite_motion import move_commanded_pose
+from rever_env.robosuite_tasks import RobosuiteTask, felt, load_robosuite
 from rever_env.success import success_alone
 from rever_env.world import DOWN, Observation, Transition, broken, silence_warnings
 
-# What robosuite's documentation says each task is about.
-_INSTRUCTIONS = {
-    "Lift": "lift the cube",
-    "Stack": "stack the red cube on the green cube",
-    "PickPlace": "put every object into its bin",
-    "PickPlaceCan": "put the can into its bin",
-    "PickPlaceBread": "put the bread into its bin",
-    "PickPlaceCereal": "put the cereal into its bin",
-    "PickPlaceMilk": "put the milk into its bin",
-    "NutAssembly": "put both nuts on their pegs",
-    "NutAssemblySquare": "put the square nut on its peg",
-    "NutAssemblyRound": "put the round nut on its peg",
-    "Door": "open the door",
-    "Wipe": "wipe the table",
-    "ToolHang": "hang the tool on the frame",
-}
 # An object's own values, not what it refers to: numbers, and containers of them.
 _PLAIN = (np.ndarray, np.generic, float, int, bool, str, type(None))
-
-
-@dataclass(frozen=True)
-class RobosuiteTask:
-    """A task of robosuite with a robot, which is the protocol's variant; or a Bridge task in it."""
-
-    name: str
-    variant: str
-    instruction: str
-    steps_max: int
-    state: tuple[Dimension, ...]
-    action: tuple[Dimension, ...]
-    making: Mapping[str, Any]  # for robosuite.make
-    camera: str = "agentview"
-    version: int = 1
-    layouts: tuple[Any, ...] = ()  # robosuite draws every layout of its own tasks
-    is_bridge: bool = False
-    is_one_arm: bool = True
-
-
-def offered(
-    names: Sequence[str], robots: Sequence[str], steps_max: int, control_hz: float
-) -> dict[str, RobosuiteTask]:
-    """Every named task with every named robot; InvalidReset for an unknown name.
-
-    robots: ROBOT, or ROBOT+ROBOT for a task of two. A Bridge task has its own robot, horizon and
-    rate of control.
-    """
-    import robosuite
-
-    bridge = tasks.load()
-    own = {name: _bridge(bridge[name]) for name in names if name in bridge}
-    names = [name for name in names if name not in own]
-    for kind, given, known in (
-        ("task", names, {*robosuite.ALL_ENVIRONMENTS, *bridge}),
-        ("robot", [one for some in robots for one in some.split("+")], robosuite.ALL_ROBOTS),
-    ):
-        unknown = sorted(set(given) - set(known))
-        if unknown:
-            raise InvalidReset(f"{kind}s {unknown}: expected some of {sorted(known)}")
-    return own | {
-        f"{name}/{robot}": _task(
-            name,
-            robot,
-            steps_max,
-            {"env_name": name, "robots": robot.split("+"), "control_freq": control_hz},
-        )
-        for name in names
-        for robot in robots
-    }
-
-
-def _task(name: str, robot: str, steps_max: int, making: Mapping[str, Any]) -> RobosuiteTask:
-    """One arm with a gripper has what a Bridge task has; others, robosuite's own numbers."""
-    import robosuite
-
-    try:
-        environment = robosuite.make(
-            **making, has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False
-        )
-    except (AssertionError, ValueError) as error:
-        raise InvalidReset(f"task {name} with {robot}: {error}") from error
-    is_one_arm = len(environment.robots) == 1 and environment.action_dim == 7
-    if is_one_arm:
-        bridge = next(iter(tasks.load().values()))
-        state, action = bridge.state, bridge.action
-    else:
-        low, high = environment.action_spec
-        action = tuple(
-            Dimension(f"action[{index}]", float(bounds[0]), float(bounds[1]), False)
-            for index, bounds in enumerate(zip(low, high, strict=True))
-        )
-        state = tuple(
-            Dimension(f"{part}[{index}]", None, None, False)
-            for part, numbers in _felt(environment.reset())
-            for index in range(len(numbers))
-        )
-    environment.close()
-    return RobosuiteTask(
-        name,
-        robot,
-        _INSTRUCTIONS.get(name, name),
-        steps_max,
-        state,
-        action,
-        making,
-        is_one_arm=is_one_arm,
-    )
-
-
-def _felt(observation: Mapping[str, Any]) -> list[tuple[str, NDArray[np.float64]]]:
-    """What each robot feels of itself, by its name."""
-    ending = "_proprio-state"
-    return [
-        (name.removesuffix(ending), np.asarray(observation[name]))
-        for name in sorted(observation)
-        if name.endswith(ending)
-    ]
-
-
-def _bridge(task: tasks.Task) -> RobosuiteTask:
-    from rever_env import robosuite_bridge
-
-    return RobosuiteTask(
-        task.name,
-        task.variant,
-        task.instruction,
-        task.steps_max,
-        task.state,
-        task.action,
-        {"env_name": robosuite_bridge.ENVIRONMENTS[task.name]},
-        robosuite_bridge.CAMERA,
-        task.version,
-        task.layouts,
-        is_bridge=True,
-    )
-
-
-def simulator() -> str:
-    """Its name with its version."""
-    return f"robosuite {metadata.version('robosuite')}"
 
 
 class RobosuiteWorld:
     """One robosuite environment with its default controller.
 
-    Not thread-safe: use it in the thread that made it. One arm is driven like a Bridge task's, in
-    metres and radians in the base's frame; moves beyond the controller's limit per step are cut, as
-    robosuite does. Other robots take robosuite's own actions. Statistics of its own tasks know
-    success alone.
+    Any thread may use it, one at a time for all such worlds of a process: robosuite draws from
+    numpy's global generator. One arm is driven as in a Bridge task, in metres and radians in the
+    base's frame (see robosuite_motion); the controller limits a move to 50 mm and 0.5 rad per step,
+    to 100 mm and 0.8 rad in the Bridge tasks. Other robots take robosuite's own actions. Statistics
+    of robosuite's own tasks contain success alone.
     """
 
     def __init__(self, task: RobosuiteTask, image_height: int, image_width: int) -> None:
-        import robosuite
-
+        robosuite = load_robosuite()
         silence_warnings()
         self.task = task
         self._size = (image_height, image_width)
         has_image = self._size != (0, 0)
+        if has_image and (reason := opengl.unavailable()):
+            raise RendererUnavailable(
+                f"renderer for {image_height} x {image_width} images: {reason}"
+            )
         cameras = (
             {"camera_heights": image_height, "camera_widths": image_width} if has_image else {}
         )
-        self._environment: Any = robosuite.make(
-            **task.making,
-            has_renderer=False,
-            has_offscreen_renderer=has_image,
-            use_camera_obs=has_image,
-            camera_names=task.camera,
-            ignore_done=True,
-            # Some models are drawn, too (a cube's size): the same one for every world, for a new
-            # one at each reset would cost a second.
-            hard_reset=False,
-            seed=0,
-            **cameras,
-        )
+        with opengl.preserved_context():
+            self._environment: Any = robosuite.make(
+                **task.making,
+                has_renderer=False,
+                has_offscreen_renderer=has_image,
+                use_camera_obs=has_image,
+                camera_names=task.camera,
+                ignore_done=True,
+                # Some models are random, too (a cube's size): every world has the same one, since
+                # a new one at each reset would cost a second.
+                hard_reset=False,
+                seed=0,
+                **cameras,
+            )
         self._robot = self._environment.robots[0]
         if task.is_one_arm:
             arm = self._robot.part_controllers[self._robot.arms[0]]
@@ -203,12 +73,14 @@ class RobosuiteWorld:
         """The same seed gives the same bytes: robosuite's generators are set again in place."""
         environment = self._environment
         check_layout(self.task.name, layout, len(self.task.layouts))
-        self._make_current()
-        if self.task.is_bridge:
-            observation = environment.begin(layout, seed)
-        else:
-            self._seed(seed)
-            observation = environment.reset()
+        with self._drawing():
+            if self.task.is_bridge:
+                observation = environment.begin(layout, seed)
+            else:
+                self._seed(seed)
+                observation = environment.reset()
+                if self.task.is_one_arm:
+                    move_commanded_pose(self._robot)
         self._check_physics(0)
         self._steps, self._ever_success = 0, False
         return self._observe(observation)
@@ -221,14 +93,13 @@ class RobosuiteWorld:
         np.random.seed(seed % 2**32)
 
     def step(self, action: NDArray[np.float64]) -> Transition:
-        """action: float64, as the task describes; of one arm (7,): dx dy dz (m), rotation vector
+        """action: float64, as the task describes.
 
-        (rad), gripper (+1 open).
+        For one arm (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open).
         """
         steps = self._running()
         if steps >= self.task.steps_max:
             raise InvalidAction(f"step {steps + 1}: expected at most {self.task.steps_max}")
-        self._make_current()
         count = len(self.task.action)
         if action.shape != (count,):
             raise InvalidAction(f"action: expected shape ({count},), got {action.shape}")
@@ -238,7 +109,8 @@ class RobosuiteWorld:
             command = np.clip(command, -1.0, 1.0)
         else:
             command = np.clip(action, *self._environment.action_spec)
-        observation, reward, _, _ = self._environment.step(command)
+        with self._drawing():
+            observation, reward, _, _ = self._environment.step(command)
         self._steps = steps + 1
         self._check_physics(self._steps)
         return Transition(
@@ -266,9 +138,9 @@ class RobosuiteWorld:
         return success_alone(is_success, self._ever_success)
 
     def save(self) -> Any:
-        """All of MuJoCo's data, and the plain values of everything that robosuite keeps beside it.
+        """All of MuJoCo's data, and the plain values of all robosuite objects with a memory.
 
-        The whole data, for robosuite goes on from poses that are one physics step old.
+        Not MuJoCo's state alone: robosuite continues from poses that are one physics step old.
         """
         self._running()
         data = copy.copy(self._environment.sim.data._data)
@@ -287,25 +159,32 @@ class RobosuiteWorld:
         for part, values in zip(self._parts(), kept, strict=True):
             vars(part).update(copy.deepcopy(values))
         self._environment.rng.bit_generator.state = rng
-        assert self._last is not None, "what was saved had been seen"
+        assert self._last is not None, "a saved world has been observed"
         return self._last
 
     def expert_action(self) -> NDArray[np.float64]:
+        return self.expert_decision().action
+
+    def expert_decision(self) -> Decision:
+        """The scripted expert's action with the reason for it; only Bridge tasks have one."""
         if not self.task.is_bridge:
             raise InvalidAction(f"task {self.task.name} has no scripted expert")
         self._running()
-        action: NDArray[np.float64] = self._environment.expert_action()
-        return action
+        decision: Decision = self._environment.expert_decision()
+        return decision
 
     def close(self) -> None:
-        # Else robosuite frees its buffers in whatever context is current: another world's pictures.
-        self._make_current()
-        self._environment.close()
+        # Otherwise robosuite would free the buffers of whatever OpenGL context is current.
+        with self._drawing():
+            self._environment.close()
 
-    def _make_current(self) -> None:
-        """robosuite draws into whatever OpenGL context is current, which may be another world's."""
-        if self._size != (0, 0):
-            self._environment.sim._render_context_offscreen.gl_ctx.make_current()
+    @contextmanager
+    def _drawing(self) -> Iterator[None]:
+        """Inside, this world's OpenGL context is current, which robosuite takes for granted."""
+        with opengl.preserved_context():
+            if self._size != (0, 0):
+                self._environment.sim._render_context_offscreen.gl_ctx.make_current()
+            yield
 
     def _running(self) -> int:
         if self._steps is None:
@@ -313,7 +192,7 @@ class RobosuiteWorld:
         return self._steps
 
     def _parts(self) -> list[Any]:
-        """Whatever remembers something from one step to the next."""
+        """The objects that keep something from one step to the next."""
         parts = [self._environment]
         for robot in self._environment.robots:
             parts += [robot, robot.composite_controller]
@@ -333,7 +212,7 @@ class RobosuiteWorld:
         if self.task.is_one_arm:
             state = self._state()
         else:
-            state = np.concatenate([numbers for _, numbers in _felt(observation)])
+            state = np.concatenate([numbers for _, numbers in felt(observation)])
         self._last = Observation(image, state.astype(np.float32), self.task.instruction)
         return self._last
 

@@ -39,7 +39,7 @@ _TICK, _WORK = "tick", "work"  # messages of our own to the inbox
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """fleet: who meets whom; idle_secs_max: a session without requests ends after that.
+    """fleet: who meets whom.
 
     whole_images: a step's image is not compared with the last one to send what changed only. Where
     nothing leaves the machine comparing takes longer than it spares.
@@ -47,7 +47,6 @@ class ServerOptions:
 
     fleet: str = "local"
     sessions_max: int = 16
-    idle_secs_max: int = 600
     whole_images: bool = False
 
 
@@ -203,6 +202,7 @@ class Server:
                     version=task.version,
                     instruction=task.instruction,
                     steps_max=task.steps_max,
+                    control_hz=task.control_hz,
                     layouts=len(task.layouts),
                     state=task.state,
                     action=task.action,
@@ -213,7 +213,6 @@ class Server:
             sessions=self._sessions(),
             sessions_max=self._options.sessions_max,
             slots_max=limits.SLOTS_MAX,
-            idle_secs_max=self._options.idle_secs_max,
         )
         return protocol.DESCRIPTION.encode(description)
 
@@ -281,8 +280,6 @@ class Server:
                 self._end(key, None)
             elif lease.holder == "awaited" and as_of - lease.opened_at > _HOLDER_SECS_MAX:
                 self._end(key, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
-            elif as_of - lease.used_at > self._options.idle_secs_max:
-                self._end(key, f"no request came for {self._options.idle_secs_max} s")
 
     def _end(self, key: str, reason: str | None) -> None:
         lease = self._leases.pop(key)

@@ -45,9 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fleet", default="local", help="who meets whom (default: local)")
     parser.add_argument("--sessions", type=int, default=16, help="at once (default: 16)")
     parser.add_argument(
-        "--idle-secs", type=int, default=600, help="a session without requests ends (default: 600)"
-    )
-    parser.add_argument(
         "--exit-with-parent",
         type=int,
         nargs="?",
@@ -174,7 +171,6 @@ def serve(arguments: argparse.Namespace) -> int:
     options = ServerOptions(
         arguments.fleet,
         arguments.sessions,
-        arguments.idle_secs,
         whole_images=endpoints.are_local,
     )
     failures: list[BaseException] = []
@@ -221,13 +217,13 @@ def _worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
     from rever_env.worlds import Worlds
 
     if arguments.robosuite:
-        from rever_env import robosuite_world
+        from rever_env import robosuite_tasks, robosuite_world
 
-        offered = robosuite_world.offered(
+        offered = robosuite_tasks.offered(
             arguments.robosuite, arguments.robots, arguments.horizon, arguments.control_hz
         )
         return Worlds(
-            offered, idle_max, robosuite_world.RobosuiteWorld, robosuite_world.simulator()
+            offered, idle_max, robosuite_world.RobosuiteWorld, robosuite_tasks.simulator()
         )
     if arguments.gymnasium:
         return _gymnasium_worlds(arguments, idle_max)

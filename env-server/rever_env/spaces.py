@@ -69,8 +69,7 @@ def layout_of(options: dict[str, Any] | None) -> int | None:
         number = -1
     if isinstance(layout, bool) or not 0 <= number < 1 << 32:
         raise ValueError(
-            "reset options: layout: expected a whole number from 0 to 4294967295, "
-            f"got {layout!r}"
+            f"reset options: layout: expected a whole number from 0 to 4294967295, got {layout!r}"
         )
     return number
 

@@ -121,6 +121,11 @@ class Task:
     state: tuple[Dimension, ...]
     action: tuple[Dimension, ...]
 
+    @property
+    def control_hz(self) -> float:
+        """Control steps per second of simulated time."""
+        return 1.0 / (self.settings.timestep * self.settings.substeps)
+
 
 def load(assets: Path | None = None) -> dict[str, Task]:
     """All tasks by SIMPLER's name; unknown or missing keys in the file are errors."""

@@ -78,7 +78,7 @@ class Transition:
 
 
 class World:
-    """One task in MuJoCo with its camera. Not thread-safe: use it in the thread that made it."""
+    """One task in MuJoCo with its camera. Any thread may use it, one at a time."""
 
     def __init__(self, task: Task, image_height: int = 128, image_width: int = 128) -> None:
         silence_warnings()
@@ -282,9 +282,7 @@ def divergence(data: mujoco.MjData) -> list[str]:
     return [name for index, name in _DIVERGENCE.items() if counts[index] > 0]
 
 
-def place_objects(
-    model: mujoco.MjModel, data: mujoco.MjData, task: Task, layout: Layout
-) -> None:
+def place_objects(model: mujoco.MjModel, data: mujoco.MjData, task: Task, layout: Layout) -> None:
     """Puts source and target above where they will rest."""
     rows = [(task.source, layout.source_x, layout.source_y, task.source_height)]
     yaws = [layout.source_yaw]

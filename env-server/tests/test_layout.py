@@ -82,8 +82,6 @@ def test_tasks_do_not_share_draws() -> None:
 
 
 @pytest.mark.parametrize(("layout", "seed"), [(24, 0), (-1, 0), (None, -1), (0, SEED_LIMIT)])
-def test_out_of_range_placements_are_refused(
-    task: Task, layout: int | None, seed: int
-) -> None:
+def test_out_of_range_placements_are_refused(task: Task, layout: int | None, seed: int) -> None:
     with pytest.raises(InvalidReset, match="expected"):
         place(task, layout, seed)

@@ -292,8 +292,8 @@ def started(thread: threading.Thread) -> Callable[[str], None]:
 
 def test_a_network_can_be_closed_after_a_server_that_was_being_asked(worlds: Worlds) -> None:
     endpoint = free_endpoint()
-    here = Endpoints((), (endpoint,), False).layout()
-    there = Endpoints((endpoint,), (), False).layout()
+    here = Endpoints((), (endpoint,), False).configuration()
+    there = Endpoints((endpoint,), (), False).configuration()
     with zenoh.open(zenoh.Config.from_json5(here)) as asker:
         for _ in range(20):
             stop = threading.Event()
@@ -331,16 +331,16 @@ def test_a_server_without_a_network_is_wrong_usage() -> None:
 
 
 def test_nothing_listens_but_what_is_named() -> None:
-    layout = json.loads(Endpoints(("tcp/127.0.0.1:1",), (), False).layout())
-    assert layout["listen"]["endpoints"] == []
-    assert not layout["scouting"]["multicast"]["enabled"]
-    assert not layout["scouting"]["gossip"]["enabled"]
-    assert "listen" not in json.loads(Endpoints((), (), True).layout())
+    configuration = json.loads(Endpoints(("tcp/127.0.0.1:1",), (), False).configuration())
+    assert configuration["listen"]["endpoints"] == []
+    assert not configuration["scouting"]["multicast"]["enabled"]
+    assert not configuration["scouting"]["gossip"]["enabled"]
+    assert "listen" not in json.loads(Endpoints((), (), True).configuration())
 
 
 def test_only_one_way_out_and_no_way_in_makes_a_client() -> None:
     def mode(connect: tuple[str, ...], listen: tuple[str, ...]) -> object:
-        return json.loads(Endpoints(connect, listen, False).layout())["mode"]
+        return json.loads(Endpoints(connect, listen, False).configuration())["mode"]
 
     first, second = "tcp/127.0.0.1:1", "tcp/127.0.0.1:2"
     assert mode((first,), ()) == "client"

@@ -1,4 +1,4 @@
-//! The zenoh keys under `rever/2/{fleet}/`, built from names that are checked.
+//! The zenoh keys under `rever/3/{fleet}/`, built from names that are checked.
 
 use crate::PROTOCOL_VERSION;
 

@@ -19,4 +19,4 @@ pub use keys::{KeyError, Keys};
 pub use message::*;
 
 /// Version of everything in this crate; peers of another version are refused in words.
-pub const PROTOCOL_VERSION: u32 = 2;
+pub const PROTOCOL_VERSION: u32 = 3;

@@ -14,12 +14,13 @@ pub fn description() -> Description {
         discrete,
     };
     let height = Dimension { high: None, ..dimension("height", 0.0, false) };
-    let task = |task: &str, instruction: &str, steps_max| TaskDescription {
+    let task = |task: &str, instruction: &str, steps_max, control_hz| TaskDescription {
         task: task.into(),
         variant: "default".into(),
         version: 1,
         instruction: instruction.into(),
         steps_max,
+        control_hz,
         layouts: 24,
         state: vec![dimension("x", 2.0, false), height.clone()],
         action: vec![dimension("x", 0.5, false), dimension("gripper", 1.0, true)],
@@ -30,14 +31,13 @@ pub fn description() -> Description {
         simulator: "rever_env".into(),
         simulator_version: "0.0.0 mujoco 3.8.0".into(),
         tasks: vec![
-            task("widowx_spoon_on_towel", "put the spoon on the towel", 60),
-            task("widowx_put_eggplant_in_basket", "put eggplant into yellow basket", 120),
+            task("widowx_spoon_on_towel", "put the spoon on the towel", 60, Some(5.0)),
+            task("widowx_put_eggplant_in_basket", "put eggplant into yellow basket", 120, None),
         ],
         image_side_max: 1024,
         sessions: 3,
         sessions_max: 16,
         slots_max: 16,
-        idle_secs_max: 600,
     }
 }
 

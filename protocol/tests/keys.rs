@@ -6,7 +6,7 @@ use protocol::Keys;
 fn keys_lie_under_version_and_fleet() {
     let keys = Keys::new("home").expect("a name");
     let check =
-        |key: Result<String, _>, expected| assert_eq!(key, Ok(format!("rever/2/home/{expected}")));
+        |key: Result<String, _>, expected| assert_eq!(key, Ok(format!("rever/3/home/{expected}")));
     check(keys.server("s1"), "server/s1");
     check(keys.describe("s1"), "server/s1/describe");
     check(keys.open("s1"), "server/s1/open");
@@ -24,11 +24,11 @@ fn keys_lie_under_version_and_fleet() {
 #[test]
 fn names_are_found_in_keys() {
     let keys = Keys::new("home").expect("a name");
-    assert_eq!(keys.server_of("rever/2/home/server/s1"), Some("s1"));
-    assert_eq!(keys.server_of("rever/2/home/server/s1/heartbeat"), Some("s1"));
-    assert_eq!(keys.session_of("rever/2/home/session/a"), Some("a"));
-    assert_eq!(keys.server_of("rever/2/home/session/a"), None);
-    assert_eq!(keys.server_of("rever/2/homes/server/s1"), None);
+    assert_eq!(keys.server_of("rever/3/home/server/s1"), Some("s1"));
+    assert_eq!(keys.server_of("rever/3/home/server/s1/heartbeat"), Some("s1"));
+    assert_eq!(keys.session_of("rever/3/home/session/a"), Some("a"));
+    assert_eq!(keys.server_of("rever/3/home/session/a"), None);
+    assert_eq!(keys.server_of("rever/3/homes/server/s1"), None);
     assert_eq!(keys.server_of("rever/1/home/server/s1"), None);
 }
 

@@ -204,7 +204,7 @@ fn the_readme_lists_every_key() {
     let section = readme.split("## Keys").nth(1).expect("a section");
     for key in &made {
         let key = key.as_ref().expect("names that may stand in keys");
-        let key = key.strip_prefix("rever/2/FLEET/").expect("the prefix of the README");
+        let key = key.strip_prefix("rever/3/FLEET/").expect("the prefix of the README");
         let parts = key.split('/').map(|part| match part {
             "SERVER" | "SESSION" | "RUN" | "NAME" => format!("{{{}}}", part.to_lowercase()),
             part => part.to_owned(),

@@ -130,8 +130,7 @@ fn structure_cases() -> Vec<Case> {
 fn field_cases() -> Vec<Case> {
     let as_array = vec![0x81, 0xa4, b'S', b'a', b'v', b'e', 0x92, 0x03, 0x00];
     let twice = changed(save(), b"\xa4slot", b"\xa8sequence");
-    let no_layout =
-        changed(changed(reset(), b"\xa6layout\x17", b""), b"\x85\xa8", b"\x84\xa8");
+    let no_layout = changed(changed(reset(), b"\xa6layout\x17", b""), b"\x85\xa8", b"\x84\xa8");
     vec![
         case(
             "unknown_message",
@@ -272,7 +271,7 @@ fn number_cases() -> Vec<Case> {
 
 fn peer_cases() -> Vec<Case> {
     let mut future = valid(&Open { protocol: PROTOCOL_VERSION, ..examples::open() });
-    future = changed(future, b"protocol\x02", b"protocol\x03");
+    future = changed(future, b"protocol\x03", b"protocol\x04");
     let other_fields = changed(future.clone(), b"holder", b"owners");
     let pixels = examples::observation().image.pixels;
     let short = changed(
@@ -299,15 +298,25 @@ fn peer_cases() -> Vec<Case> {
         case(
             "bounds_missing",
             "description",
-            changed(described, &high_at(1.0), b"\xa4high\xc0"),
+            changed(described.clone(), &high_at(1.0), b"\xa4high\xc0"),
             "description is invalid: dimension gripper: expected whole bounds, for it is discrete",
         ),
-        case("protocol", "open", future, "open is invalid: expected protocol 2, got protocol 3"),
+        case(
+            "control_hz",
+            "description",
+            changed(
+                described.clone(),
+                &[b"control_hz", &float(5.0)[..]].concat(),
+                &[b"control_hz", &float(0.0)[..]].concat(),
+            ),
+            "description is invalid: control_hz: expected a number above 0, got 0",
+        ),
+        case("protocol", "open", future, "open is invalid: expected protocol 3, got protocol 4"),
         case(
             "protocol_and_fields",
             "open",
             other_fields,
-            "open is invalid: expected protocol 2, got protocol 3",
+            "open is invalid: expected protocol 3, got protocol 4",
         ),
         case(
             "image_bytes",

@@ -32,13 +32,17 @@ class Dimension:
 
 @dataclass(frozen=True)
 class TaskDescription:
-    """One task in one variant. layouts: how many fixed ones there are."""
+    """One task in one variant. layouts: how many fixed ones there are.
+
+    control_hz: control steps per second of simulated time, where it is known.
+    """
 
     task: str
     variant: str
     version: U32
     instruction: str
     steps_max: U32
+    control_hz: float | None
     layouts: U32
     state: tuple[Dimension, ...]
     action: tuple[Dimension, ...]
@@ -57,7 +61,6 @@ class Description:
     sessions: U32
     sessions_max: U32
     slots_max: U32
-    idle_secs_max: U32
 
     def validate(self) -> None:
         value.protocol(self.protocol)
@@ -70,6 +73,8 @@ class Description:
             value.name("variant", task.variant)
             value.text("instruction", task.instruction)
             value.range("steps_max", task.steps_max, 1, 1_000_000)
+            if task.control_hz is not None:
+                value.positive("control_hz", task.control_hz)
             value.length("state", task.state, 0, limits.STATE_DIMENSIONS_MAX)
             value.length("action", task.action, 1, limits.ACTION_DIMENSIONS_MAX)
             for dimension in task.state + task.action:
@@ -78,4 +83,3 @@ class Description:
         value.range("sessions_max", self.sessions_max, 1, limits.SESSIONS_MAX)
         value.range("sessions", self.sessions, 0, self.sessions_max)
         value.range("slots_max", self.slots_max, 0, limits.SLOTS_MAX)
-        value.range("idle_secs_max", self.idle_secs_max, 1, 1_000_000)

@@ -1,8 +1,8 @@
-"""The zenoh keys under rever/1/{fleet}/, built from names that are checked."""
+"""The zenoh keys under rever/3/{fleet}/, built from names that are checked."""
 
 import re
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 

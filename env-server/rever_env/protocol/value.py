@@ -56,6 +56,13 @@ def finite(field: str, values: tuple[float, ...]) -> None:
             raise ValueError(f"{field}: expected 32-bit numbers, got {number} at index {index}")
 
 
+def positive(field: str, value: float) -> None:
+    """A number above zero."""
+    finite(field, (value,))
+    if value <= 0.0:
+        raise ValueError(f"{field}: expected a number above 0, got {value:g}")
+
+
 def range(field: str, value: int, low: int, high: int) -> None:
     """A whole number from low to high, both included."""
     if not low <= value <= high:

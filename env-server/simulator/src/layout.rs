@@ -54,10 +54,7 @@ fn draw(task: &Task, seed: u64) -> Result<Layout, Fault> {
             target_x: generator.uniform(ranges.target_x),
             target_y: generator.uniform(ranges.target_y),
         };
-        let apart = distance(
-            layout.source_x - layout.target_x,
-            layout.source_y - layout.target_y,
-        );
+        let apart = distance(layout.source_x - layout.target_x, layout.source_y - layout.target_y);
         if apart >= ranges.separation_min && !is_near_grid_layout(task, &layout) {
             return Ok(layout);
         }
@@ -74,8 +71,7 @@ fn is_near_grid_layout(task: &Task, layout: &Layout) -> bool {
     let radius = ranges.exclusion_radius;
     task.rule.grid.layouts.iter().any(|grid| {
         distance(layout.source_x - grid.source_x, layout.source_y - grid.source_y) <= radius
-            && distance(layout.target_x - grid.target_x, layout.target_y - grid.target_y)
-                <= radius
+            && distance(layout.target_x - grid.target_x, layout.target_y - grid.target_y) <= radius
             && turn(layout.source_yaw - grid.source_yaw) <= ranges.exclusion_yaw
     })
 }

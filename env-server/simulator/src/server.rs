@@ -39,8 +39,6 @@ pub struct ServerOptions {
     pub fleet: String,
     /// At once.
     pub sessions_max: u32,
-    /// A session without requests ends after that.
-    pub idle_secs_max: u32,
 }
 
 /// Serves in the thread that calls `run`.
@@ -198,6 +196,7 @@ impl<'a> Server<'a> {
             version: task.rule.version,
             instruction: task.rule.instruction.clone(),
             steps_max: task.rule.steps_max,
+            control_hz: Some(task.settings.control_hz() as f32),
             layouts: task.rule.grid.layouts.len() as u32,
             state: task.state.clone(),
             action: task.action.clone(),
@@ -216,7 +215,6 @@ impl<'a> Server<'a> {
             sessions: self.sessions(),
             sessions_max: self.options.sessions_max,
             slots_max: limits::SLOTS_MAX,
-            idle_secs_max: self.options.idle_secs_max,
         }
     }
 
@@ -310,7 +308,6 @@ impl<'a> Server<'a> {
     }
 
     fn end_abandoned(&mut self, now: Instant) {
-        let idle_max = Duration::from_secs(self.options.idle_secs_max.into());
         let mut ended = Vec::new();
         for (name, lease) in &self.leases {
             let Signs { used_at, holder } = *locked(&lease.signs);
@@ -324,9 +321,6 @@ impl<'a> Server<'a> {
             {
                 let seconds = HOLDER_WAIT_MAX.as_secs();
                 let reason = format!("expected its holder's token within {seconds} s");
-                ended.push((name.clone(), Some(reason)));
-            } else if idle > idle_max {
-                let reason = format!("no request came for {} s", idle_max.as_secs());
                 ended.push((name.clone(), Some(reason)));
             }
         }

@@ -42,9 +42,6 @@ pub struct Arguments {
     /// At once.
     #[arg(long, default_value_t = 16)]
     sessions: u32,
-    /// A session without requests ends.
-    #[arg(long, default_value_t = 600)]
-    idle_secs: u32,
     /// End when this parent process is gone.
     #[arg(long, value_name = "PID")]
     exit_with_parent: Option<u32>,
@@ -65,11 +62,7 @@ pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
     let network = zenoh::open(configuration(&arguments)?)
         .wait()
         .map_err(|error| anyhow!("cannot open the network: {error}"))?;
-    let options = ServerOptions {
-        fleet: arguments.fleet,
-        sessions_max: arguments.sessions,
-        idle_secs_max: arguments.idle_secs,
-    };
+    let options = ServerOptions { fleet: arguments.fleet, sessions_max: arguments.sessions };
     let id_file = arguments.id_file;
     let ready = move |id: &str| -> Result<()> {
         if let Some(path) = &id_file {

@@ -156,6 +156,13 @@ struct Bounds {
     high: f32,
 }
 
+impl WorldSettings {
+    /// Control steps per second of simulated time.
+    pub fn control_hz(&self) -> f64 {
+        1.0 / (self.timestep * self.substeps as f64)
+    }
+}
+
 impl From<Bounds> for Dimension {
     fn from(Bounds { name, low, high }: Bounds) -> Dimension {
         Dimension { name, low: Some(low), high: Some(high), discrete: false }

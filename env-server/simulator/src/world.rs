@@ -11,8 +11,8 @@ use crate::camera::Camera;
 use crate::controller::{ARM_JOINTS, Controller, Pose};
 use crate::expert::{self, Sight};
 use crate::fault::Fault;
-use crate::model::{self, Names, Vector};
 use crate::layout::place;
+use crate::model::{self, Names, Vector};
 use crate::success::{Judge, Memory};
 use crate::tasks::{ACTION_LENGTH, Layout, STATE_LENGTH, Task};
 

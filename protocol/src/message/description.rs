@@ -39,6 +39,9 @@ pub struct TaskDescription {
     pub instruction: String,
     /// Steps after which an episode is truncated.
     pub steps_max: u32,
+    /// Control steps per second of simulated time, where it is known.
+    #[serde(deserialize_with = "single::maybe_one")]
+    pub control_hz: Option<f32>,
     /// Fixed layouts, numbered from 0; the random ones lie beside them.
     pub layouts: u32,
     /// What the numbers of a state are.
@@ -69,8 +72,6 @@ pub struct Description {
     pub sessions_max: u32,
     /// Save slots of a session.
     pub slots_max: u32,
-    /// Seconds without a request after which a session ends.
-    pub idle_secs_max: u32,
 }
 
 impl Dimension {
@@ -113,6 +114,9 @@ impl Message for Description {
             value::name("variant", &task.variant)?;
             value::text("instruction", &task.instruction)?;
             value::range("steps_max", task.steps_max.into(), 1, 1_000_000)?;
+            if let Some(rate) = task.control_hz {
+                value::positive("control_hz", rate)?;
+            }
             value::length("state", task.state.len(), 0, STATE_DIMENSIONS_MAX)?;
             value::length("action", task.action.len(), 1, ACTION_DIMENSIONS_MAX)?;
             task.state.iter().chain(&task.action).try_for_each(Dimension::validate)?;
@@ -120,7 +124,6 @@ impl Message for Description {
         value::range("image_side_max", self.image_side_max.into(), 0, IMAGE_SIDE_MAX as u64)?;
         value::range("sessions_max", self.sessions_max.into(), 1, SESSIONS_MAX.into())?;
         value::range("sessions", self.sessions.into(), 0, self.sessions_max.into())?;
-        value::range("slots_max", self.slots_max.into(), 0, SLOTS_MAX.into())?;
-        value::range("idle_secs_max", self.idle_secs_max.into(), 1, 1_000_000)
+        value::range("slots_max", self.slots_max.into(), 0, SLOTS_MAX.into())
     }
 }

@@ -49,6 +49,15 @@ pub fn finite(field: &str, values: &[f32]) -> Result<(), String> {
     }
 }
 
+/// A number above zero.
+pub fn positive(field: &str, value: f32) -> Result<(), String> {
+    finite(field, &[value])?;
+    if value <= 0.0 {
+        return Err(format!("{field}: expected a number above 0, got {value}"));
+    }
+    Ok(())
+}
+
 /// A whole number in a range.
 pub fn range(field: &str, value: u64, low: u64, high: u64) -> Result<(), String> {
     if !(low..=high).contains(&value) {

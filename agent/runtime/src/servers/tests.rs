@@ -20,7 +20,6 @@ fn start(folder: &Path, script: &str, count: usize) -> Result<LocalServers> {
         connect: "tcp/127.0.0.1:1".to_owned(),
         fleet: "test".to_owned(),
         sessions_each: 1,
-        idle_secs: None,
     };
     LocalServers::start(program, &options)
 }
