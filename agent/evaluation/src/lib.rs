@@ -8,11 +8,17 @@
 pub mod suite;
 
 // What came of them.
-pub mod calibration;
+pub mod comparisons;
+pub mod counted;
+pub mod estimate;
 pub mod results;
+
+// Statistics that know nothing of episodes.
+pub mod calibration;
 pub mod statistics;
 
 // How it is shown.
+pub mod headline;
 pub mod report;
 pub mod result_file;
 pub mod table;

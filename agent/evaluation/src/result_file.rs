@@ -1,35 +1,39 @@
-//! The file that `--json` writes: the same figures as the tables, for programs.
+//! The file that `--json` writes: the same figures as the tables, for programs, with what they were made from.
 
 use std::path::Path;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
+use decision::Setting;
 use serde::Serialize;
 use serde_json::Value;
 
-use crate::results::{Rates, Results, StepTime};
-use crate::statistics::Rate;
-use decision::{Setting, VARIANT_DEFAULT};
+use crate::comparisons::{SettingGain, SettingHeadroom};
+use crate::results::{Counts, Results, StepTime, TaskResult};
 
-/// The task that stands for all tasks together.
+/// The task, and the variant, that stands for the average over all of them, each of which counts the same.
 pub const AVERAGE: &str = "average";
 
-/// The whole file. Rates, gains and interval ends are fractions of 1.
+/// The whole file. Rates, gains, shares and interval ends are fractions of 1; all intervals are 95 % intervals.
 #[derive(Debug, Serialize)]
 pub struct ResultFile {
-    /// One row per setting and task, and one per setting for all tasks.
+    /// One row per setting and task in its variant, and one per setting for the average.
     pub rows: Vec<Row>,
     /// One entry per comparison.
     pub paired: Vec<Paired>,
-    /// One entry per setting that chooses, where one sample and the oracle ran beside it.
+    /// One entry per setting that chooses, where a single sample and the oracle ran beside it.
     pub headroom: Vec<Headroom>,
-    /// Of a whole batch; none when nothing was decided.
+    /// Of one decision: its share of its batch's time; none when nothing was decided.
     pub decision_ms: Option<StepTime>,
+    /// The median number of decisions that were made together.
+    pub batch_size: Option<f64>,
     /// From an action to the next observation.
     pub step_ms: Option<StepTime>,
-    /// Of that, the simulator's own; none when no simulator said so.
+    /// Of that, the simulator's own.
     pub simulator_ms: Option<StepTime>,
-    /// Of everything that the results depend on, by name.
-    pub versions: Value,
+    /// What the figures were made from, under the names that the caller gives: the run's name, options and versions, the
+    /// command line, the build's commit, the date.
+    #[serde(flatten)]
+    pub made_from: Value,
 }
 
 /// One setting on one task.
@@ -37,7 +41,7 @@ pub struct ResultFile {
 pub struct Row {
     /// The task's name, or [`AVERAGE`].
     pub task: String,
-    /// The task's variant.
+    /// The task's variant, or [`AVERAGE`].
     pub variant: String,
     /// How candidates were chosen.
     pub strategy: String,
@@ -47,17 +51,20 @@ pub struct Row {
     pub temperature: f32,
     /// Episodes with an outcome: the number that all rates of the row are over.
     pub episodes: u64,
-    /// Attempts that broke and were run again or given up; in no rate.
-    pub faults: u64,
+    /// Different initial layouts among them; episodes that share one are a cluster.
+    pub starts: u64,
+    /// What the rates do not tell.
+    #[serde(flatten)]
+    pub counts: Counts,
     /// The object was held at some step.
     pub grasp: Option<f64>,
-    /// Lower end of the 95 % Wilson interval of `grasp`.
+    /// Lower end of the interval of `grasp`.
     pub grasp_low: f64,
     /// Upper end.
     pub grasp_high: f64,
-    /// Success at the last step.
+    /// Success at the last step; of the average none while a task has no episode.
     pub success: Option<f64>,
-    /// Lower end of the 95 % Wilson interval of `success`.
+    /// Lower end of the interval of `success`.
     pub success_low: f64,
     /// Upper end.
     pub success_high: f64,
@@ -67,7 +74,7 @@ pub struct Row {
     pub success_released: Option<f64>,
 }
 
-/// The difference of last-step success, `a` less `b`, averaged over tasks.
+/// The difference of last-step success, `a` minus `b`, averaged over tasks.
 #[derive(Debug, Serialize)]
 pub struct Paired {
     /// The strategy in question.
@@ -79,16 +86,22 @@ pub struct Paired {
     /// Of `a`; `b` has the same unless it is greedy.
     pub temperature: f32,
     /// Pairs over all tasks.
-    pub episodes: usize,
+    pub episodes: u64,
+    /// Different initial layouts among them.
+    pub starts: u64,
+    /// The success of `a` over the pairs.
+    pub success_a: f64,
+    /// The success of `b` over the pairs.
+    pub success_b: f64,
     /// The difference.
     pub gain: f64,
-    /// Lower end of its 95 % bootstrap interval.
+    /// Lower end of its interval.
     pub low: f64,
     /// Upper end.
     pub high: f64,
 }
 
-/// The part of the way from one sample to the oracle.
+/// The share of the gap between a single sample and the oracle that a setting closes.
 #[derive(Debug, Serialize)]
 pub struct Headroom {
     /// The strategy in question.
@@ -97,45 +110,38 @@ pub struct Headroom {
     pub candidates: u32,
     /// Sampling temperature of all three.
     pub temperature: f32,
+    /// Episodes that all three have run.
+    pub episodes: u64,
     /// 1 is as good as the oracle.
     pub fraction: f64,
+    /// Lower end of its interval; none where the oracle may be no better than a single sample.
+    pub low: Option<f64>,
+    /// Upper end.
+    pub high: Option<f64>,
 }
 
 impl ResultFile {
-    /// The file's contents.
-    pub fn new(results: &Results, versions: Value) -> ResultFile {
+    /// The file's contents. `made_from` is an object such as a run's header with the command line, the build's commit and the
+    /// date added.
+    pub fn new(results: &Results, made_from: Value) -> Result<ResultFile> {
+        ensure!(made_from.is_object(), "result file: expected names and values, got {made_from}");
         let mut rows = Vec::new();
         for result in &results.settings {
-            for (task, rates) in results.tasks.iter().zip(&result.tasks) {
-                rows.push(row(&task.task, &task.variant, &result.setting, rates));
+            for (task, of_task) in results.tasks.iter().zip(&result.tasks) {
+                rows.push(row(&task.task, &task.variant, &result.setting, of_task));
             }
-            rows.push(row(AVERAGE, VARIANT_DEFAULT, &result.setting, &result.all));
+            rows.push(row(AVERAGE, AVERAGE, &result.setting, &result.all));
         }
-        let paired = results.gains.iter().map(|gain| Paired {
-            a: gain.better.strategy.to_string(),
-            b: gain.worse.strategy.to_string(),
-            candidates: gain.better.candidates,
-            temperature: gain.better.temperature,
-            episodes: gain.gain.pairs,
-            gain: gain.gain.mean,
-            low: gain.gain.interval.low,
-            high: gain.gain.interval.high,
-        });
-        let headroom = results.headroom.iter().map(|headroom| Headroom {
-            strategy: headroom.setting.strategy.to_string(),
-            candidates: headroom.setting.candidates,
-            temperature: headroom.setting.temperature,
-            fraction: headroom.fraction,
-        });
-        ResultFile {
+        Ok(ResultFile {
             rows,
-            paired: paired.collect(),
-            headroom: headroom.collect(),
+            paired: results.gains.iter().map(Paired::from).collect(),
+            headroom: results.headroom.iter().map(Headroom::from).collect(),
             decision_ms: results.decision_ms,
+            batch_size: results.batch_size,
             step_ms: results.step_ms,
             simulator_ms: results.simulator_ms,
-            versions,
-        }
+            made_from,
+        })
     }
 
     /// Writes the file.
@@ -146,24 +152,56 @@ impl ResultFile {
     }
 }
 
-fn row(task: &str, variant: &str, setting: &Setting, rates: &Rates) -> Row {
-    let value = |rate: Rate| rate.value();
-    let (grasp, interval) = (rates.grasped.interval(), rates.success.interval());
+impl From<&SettingGain> for Paired {
+    fn from(one: &SettingGain) -> Paired {
+        Paired {
+            a: one.better.strategy.to_string(),
+            b: one.worse.strategy.to_string(),
+            candidates: one.better.candidates,
+            temperature: one.better.temperature,
+            episodes: one.gain.pairs,
+            starts: one.gain.starts,
+            success_a: one.gain.better_rate,
+            success_b: one.gain.worse_rate,
+            gain: one.gain.mean,
+            low: one.gain.interval.low,
+            high: one.gain.interval.high,
+        }
+    }
+}
+
+impl From<&SettingHeadroom> for Headroom {
+    fn from(one: &SettingHeadroom) -> Headroom {
+        Headroom {
+            strategy: one.setting.strategy.to_string(),
+            candidates: one.setting.candidates,
+            temperature: one.setting.temperature,
+            episodes: one.headroom.episodes,
+            fraction: one.headroom.fraction,
+            low: one.headroom.interval.map(|interval| interval.low),
+            high: one.headroom.interval.map(|interval| interval.high),
+        }
+    }
+}
+
+fn row(task: &str, variant: &str, setting: &Setting, result: &TaskResult) -> Row {
+    let (grasped, success) = (result.grasped, result.success);
     Row {
         task: task.to_owned(),
         variant: variant.to_owned(),
         strategy: setting.strategy.to_string(),
         candidates: setting.candidates,
         temperature: setting.temperature,
-        episodes: rates.success.trials,
-        faults: rates.faults,
-        grasp: value(rates.grasped),
-        grasp_low: grasp.low,
-        grasp_high: grasp.high,
-        success: value(rates.success),
-        success_low: interval.low,
-        success_high: interval.high,
-        success_any_step: value(rates.ever_success),
-        success_released: value(rates.released_success),
+        episodes: success.episodes,
+        starts: success.starts,
+        counts: result.counts,
+        grasp: grasped.value,
+        grasp_low: grasped.interval.low,
+        grasp_high: grasped.interval.high,
+        success: success.value,
+        success_low: success.interval.low,
+        success_high: success.interval.high,
+        success_any_step: result.ever_success.value,
+        success_released: result.released_success.value,
     }
 }

@@ -1,16 +1,17 @@
 //! The results of a run: rates of every setting on every task, gains between paired settings, headroom, decision time.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use anyhow::Result;
+use decision::{Setting, TaskId};
+use protocol::Statistics;
 use serde_json::Value;
-
-use crate::statistics::{Gain, RESAMPLES, Rate, headroom_fraction, paired_bootstrap, quantile};
-use decision::{Setting, Strategy, TaskId};
 use store::run::{EpisodeSummary, FaultRecord};
 
-/// Bootstraps are seeded, so that the same records always give the same tables.
-const BOOTSTRAP_SEED: u64 = 0;
+use crate::comparisons::{self, SettingGain, SettingHeadroom};
+use crate::counted::{SettingEpisodes, TaskEpisodes};
+use crate::estimate::{Rate, TaskClusters};
+use crate::statistics::quantile;
 
 /// Everything that tables and figures show.
 #[derive(Debug, Clone)]
@@ -21,14 +22,18 @@ pub struct Results {
     pub settings: Vec<SettingResult>,
     /// The comparisons that a verifier has to stand.
     pub gains: Vec<SettingGain>,
-    /// How far each setting went from one sample to the oracle.
+    /// How much of the gap between a single sample and the oracle each setting closes.
     pub headroom: Vec<SettingHeadroom>,
-    /// From the observations to the chosen actions of a whole batch.
+    /// Of a single decision: its share of the time of its batch.
     pub decision_ms: Option<StepTime>,
+    /// The median number of decisions that were made together.
+    pub batch_size: Option<f64>,
     /// From an action to the next observation, with the server's other sessions before it.
     pub step_ms: Option<StepTime>,
     /// The part of it that the simulator itself took.
     pub simulator_ms: Option<StepTime>,
+    /// The names of the episodes that are in the rates.
+    pub counted: BTreeSet<String>,
 }
 
 /// One setting on every task.
@@ -36,15 +41,15 @@ pub struct Results {
 pub struct SettingResult {
     /// The setting.
     pub setting: Setting,
-    /// In the order of the tasks; no trials where the setting did not run.
-    pub tasks: Vec<Rates>,
-    /// All tasks together.
-    pub all: Rates,
+    /// In the order of the tasks; no episodes where the setting did not run.
+    pub tasks: Vec<TaskResult>,
+    /// The average over tasks, each of which counts the same, and the counts of all tasks together.
+    pub all: TaskResult,
 }
 
-/// What is counted over episodes.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Rates {
+/// Rates and counts of one setting, on one task or over all.
+#[derive(Debug, Clone, Copy)]
+pub struct TaskResult {
     /// The object was held at some step.
     pub grasped: Rate,
     /// Success at the last step: SIMPLER's result.
@@ -53,28 +58,27 @@ pub struct Rates {
     pub ever_success: Rate,
     /// Success at the last step with the object let go.
     pub released_success: Rate,
-    /// Attempts that broke. They are in none of the rates.
+    /// What the rates do not tell.
+    pub counts: Counts,
+}
+
+/// What is counted beside the rates.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+pub struct Counts {
+    /// Attempts without an outcome, run again or given up. They are in no rate.
     pub faults: u64,
-}
-
-/// The gain of one setting over another on the episodes that both have run.
-#[derive(Debug, Clone)]
-pub struct SettingGain {
-    /// The setting in question.
-    pub better: Setting,
-    /// What it is compared with.
-    pub worse: Setting,
-    /// Difference of last-step success.
-    pub gain: Gain,
-}
-
-/// The part of the way from one sample to the oracle that an setting has gone, at one temperature.
-#[derive(Debug, Clone)]
-pub struct SettingHeadroom {
-    /// The setting in question.
-    pub setting: Setting,
-    /// 0: no better than one sample; 1: as good as the oracle with as many candidates.
-    pub fraction: f64,
+    /// Different episodes in which the policy never acted: not one candidate was well formed. They are in no rate.
+    pub never_acted: u64,
+    /// Episodes that repeat another one, for nothing in them is drawn; counted once.
+    pub repeats: u64,
+    /// Candidates of all counted episodes and of those in which the policy never acted.
+    pub proposed: u64,
+    /// Those that hold no valid action; never executed.
+    pub malformed: u64,
+    /// Decisions of the same episodes.
+    pub decisions: u64,
+    /// Those without a well-formed candidate: the robot held still.
+    pub held_steps: u64,
 }
 
 /// Milliseconds over all steps of all episodes; there is none without a step.
@@ -86,8 +90,6 @@ pub struct StepTime {
     pub p95: f64,
 }
 
-type BySetting<'a> = Vec<(Setting, Vec<&'a EpisodeSummary>)>;
-
 impl Results {
     /// Counts the episodes of a run and the attempts that broke; `order` are the run's tasks, see [`tasks_in_order`].
     pub fn new(
@@ -95,47 +97,55 @@ impl Results {
         faults: &[FaultRecord],
         order: &[TaskId],
     ) -> Result<Results> {
-        let mut by_setting: BySetting = Vec::new();
-        for summary in summaries {
-            of_setting(&mut by_setting, summary.identity.setting()?).push(summary);
+        let identities = || {
+            let recorded = summaries.iter().map(|summary| &summary.identity);
+            recorded.chain(faults.iter().map(|fault| &fault.identity))
+        };
+        let tasks = in_order(identities().map(|identity| identity.task_id()), order);
+        let mut settings: Vec<Setting> = Vec::new();
+        for identity in identities() {
+            let setting = identity.setting()?;
+            // A setting of which every attempt broke still has its row.
+            if !settings.contains(&setting) {
+                settings.push(setting);
+            }
         }
-        let mut broken: Vec<(Setting, TaskId)> = Vec::new();
-        for fault in faults {
-            let setting = fault.identity.setting()?;
-            // An setting of which every attempt broke still has its row.
-            of_setting(&mut by_setting, setting);
-            broken.push((setting, fault.identity.task_id()));
-        }
-        by_setting.sort_by(|(a, _), (b, _)| {
+        settings.sort_by(|a, b| {
             let by_temperature = b.temperature.total_cmp(&a.temperature);
             by_temperature.then(a.strategy.cmp(&b.strategy)).then(a.candidates.cmp(&b.candidates))
         });
-        let ran = summaries.iter().map(|summary| summary.identity.task_id());
-        let tasks = in_order(ran.chain(broken.iter().map(|(_, task)| task.clone())), order);
+        let mut episodes: Vec<SettingEpisodes<'_>> =
+            settings.iter().map(|setting| SettingEpisodes::new(*setting, tasks.len())).collect();
+        for summary in summaries {
+            let (setting, id) = (summary.identity.setting()?, summary.identity.task_id());
+            let mine = episodes.iter_mut().find(|one| one.setting == setting);
+            let task = tasks.iter().position(|task| *task == id);
+            if let Some((mine, task)) = mine.zip(task) {
+                mine.insert(task, summary);
+            }
+        }
+        let all_counted =
+            || episodes.iter().flat_map(|one| &one.tasks).flat_map(TaskEpisodes::counted);
         Ok(Results {
-            gains: gains(&by_setting, &tasks),
-            headroom: headroom(&by_setting),
+            gains: comparisons::gains(&episodes),
+            headroom: comparisons::headroom(&episodes),
             decision_ms: step_time(summaries, |summary| &summary.decision_ms),
+            batch_size: median(summaries.iter().flat_map(|one| &one.batch_size)),
             step_ms: step_time(summaries, |summary| &summary.step_ms),
             simulator_ms: step_time(summaries, |summary| &summary.simulator_ms),
-            settings: by_setting
+            counted: all_counted().map(|summary| summary.identity.id()).collect(),
+            settings: episodes
                 .iter()
-                .map(|(setting, list)| setting_result(*setting, list, &broken, &tasks))
-                .collect(),
+                .map(|one| setting_result(one, &tasks, faults))
+                .collect::<Result<_>>()?,
             tasks,
         })
     }
-}
 
-fn of_setting<'a, 'b>(
-    by_setting: &'b mut BySetting<'a>,
-    setting: Setting,
-) -> &'b mut Vec<&'a EpisodeSummary> {
-    let place = by_setting.iter().position(|(known, _)| *known == setting).unwrap_or_else(|| {
-        by_setting.push((setting, Vec::new()));
-        by_setting.len() - 1
-    });
-    &mut by_setting[place].1
+    /// The comparison to tell first.
+    pub fn main_gain(&self) -> Option<&SettingGain> {
+        comparisons::main_gain(&self.gains)
+    }
 }
 
 /// The tasks that a run was asked for, from its options: the order of its tables.
@@ -153,233 +163,98 @@ fn in_order(tasks: impl Iterator<Item = TaskId>, order: &[TaskId]) -> Vec<TaskId
 }
 
 fn setting_result(
-    setting: Setting,
-    list: &[&EpisodeSummary],
-    broken: &[(Setting, TaskId)],
+    episodes: &SettingEpisodes<'_>,
     tasks: &[TaskId],
-) -> SettingResult {
-    let of_task = |task: &TaskId| {
-        let faults =
-            broken.iter().filter(|(other, name)| *other == setting && name == task).count();
-        rates(
-            list.iter().copied().filter(|summary| summary.identity.task_id() == *task),
-            faults as u64,
-        )
-    };
-    let faults = broken.iter().filter(|(other, _)| *other == setting).count();
-    SettingResult {
-        setting,
-        tasks: tasks.iter().map(of_task).collect(),
-        all: rates(list.iter().copied(), faults as u64),
-    }
-}
-
-fn rates<'a>(summaries: impl Iterator<Item = &'a EpisodeSummary> + Clone, faults: u64) -> Rates {
-    let of = |read: fn(&protocol::Statistics) -> bool| {
-        Rate::of(summaries.clone().map(|summary| read(&summary.statistics)))
-    };
-    Rates {
-        grasped: of(|statistics| statistics.ever_grasped),
-        success: of(|statistics| statistics.is_success),
-        ever_success: of(|statistics| statistics.ever_success),
-        released_success: of(|statistics| statistics.released_success),
-        faults,
-    }
-}
-
-/// The verifier against everything that costs less to have, and with agreement against agreement alone.
-fn gains(by_setting: &BySetting, tasks: &[TaskId]) -> Vec<SettingGain> {
-    let is_verifier = |setting: &Setting| {
-        matches!(setting.strategy, Strategy::Verifier | Strategy::VerifierMedoid)
-    };
-    let mut gains = Vec::new();
-    for (better, ours) in by_setting.iter().filter(|(setting, _)| is_verifier(setting)) {
-        for (worse, theirs) in by_setting {
-            let same_temperature = worse.temperature == better.temperature;
-            let is_compared = match worse.strategy {
-                Strategy::Greedy => true,
-                Strategy::Sample => same_temperature,
-                Strategy::FirstWellFormed
-                | Strategy::Majority
-                | Strategy::Medoid
-                | Strategy::Worst => same_temperature && worse.candidates == better.candidates,
-                Strategy::Verifier => {
-                    better.strategy == Strategy::VerifierMedoid
-                        && same_temperature
-                        && worse.candidates == better.candidates
-                }
-                Strategy::VerifierMedoid | Strategy::Oracle => false,
-            };
-            if is_compared && let Some(gain) = gain(ours, theirs, tasks) {
-                gains.push(SettingGain { better: *better, worse: *worse, gain });
+    faults: &[FaultRecord],
+) -> Result<SettingResult> {
+    let mut counts = Vec::with_capacity(tasks.len());
+    for (task, of_task) in tasks.iter().zip(&episodes.tasks) {
+        let mut mine = Vec::new();
+        for fault in faults {
+            let identity = &fault.identity;
+            if identity.task_id() == *task && identity.setting()? == episodes.setting {
+                mine.push(fault);
             }
         }
+        counts.push(count(of_task, &mine));
     }
-    gains
-}
-
-/// None when some task of the run has no pair yet: an average over other tasks would be another quantity.
-fn gain(ours: &[&EpisodeSummary], theirs: &[&EpisodeSummary], tasks: &[TaskId]) -> Option<Gain> {
-    let place = |summary: &EpisodeSummary| {
-        let identity = &summary.identity;
-        (identity.task.clone(), identity.variant.clone(), identity.episode)
-    };
-    let theirs: BTreeMap<_, f64> =
-        theirs.iter().map(|summary| (place(summary), success(summary))).collect();
-    let of_task = |task: &TaskId| {
-        let ours = ours.iter().filter(|summary| summary.identity.task_id() == *task);
-        let pair =
-            |summary: &&EpisodeSummary| Some(success(summary) - theirs.get(&place(summary))?);
-        ours.filter_map(pair).collect()
-    };
-    let differences: Vec<Vec<f64>> = tasks.iter().map(of_task).collect();
-    paired_bootstrap(&differences, RESAMPLES, BOOTSTRAP_SEED)
-}
-
-fn headroom(by_setting: &BySetting) -> Vec<SettingHeadroom> {
-    let value = |strategy: Strategy, candidates: u32, temperature: f32| {
-        let setting = Setting { strategy, candidates, temperature };
-        let (_, list) = by_setting.iter().find(|(known, _)| *known == setting)?;
-        Rate::of(list.iter().map(|summary| summary.statistics.is_success)).value()
-    };
-    let mut headroom = Vec::new();
-    for (setting, _) in by_setting {
-        let Setting { strategy, candidates, temperature } = *setting;
-        if matches!(strategy, Strategy::Greedy | Strategy::Sample | Strategy::Oracle) {
-            continue;
+    let result = |of: &[TaskEpisodes<'_>], counts: &[Counts]| {
+        let rate = |read: fn(&Statistics) -> bool| {
+            let clusters: Vec<TaskClusters> = of.iter().map(|task| task.clusters(read)).collect();
+            Rate::over_tasks(&clusters)
+        };
+        TaskResult {
+            grasped: rate(|statistics| statistics.ever_grasped),
+            success: rate(|statistics| statistics.is_success),
+            ever_success: rate(|statistics| statistics.ever_success),
+            released_success: rate(|statistics| statistics.released_success),
+            counts: counts.iter().copied().fold(Counts::default(), Counts::plus),
         }
-        let fraction = value(Strategy::Sample, 1, temperature)
-            .zip(value(strategy, candidates, temperature))
-            .zip(value(Strategy::Oracle, candidates, temperature))
-            .and_then(|((sample, chosen), oracle)| headroom_fraction(sample, chosen, oracle));
-        if let Some(fraction) = fraction {
-            headroom.push(SettingHeadroom { setting: *setting, fraction });
+    };
+    let each = episodes.tasks.chunks(1).zip(counts.chunks(1));
+    Ok(SettingResult {
+        setting: episodes.setting,
+        tasks: each.map(|(task, counts)| result(task, counts)).collect(),
+        all: result(&episodes.tasks, &counts),
+    })
+}
+
+fn count(episodes: &TaskEpisodes<'_>, faults: &[&FaultRecord]) -> Counts {
+    let lost = faults.iter().filter(|fault| fault.never_acted).map(|fault| fault.identity.id());
+    let recorded = episodes.never_acted().iter().map(|summary| summary.identity.id());
+    let mut never_acted: BTreeSet<String> = lost.chain(recorded).collect();
+    // An episode that has an outcome after all is in the rates.
+    for summary in episodes.counted() {
+        never_acted.remove(&summary.identity.id());
+    }
+    let mut counts = Counts {
+        faults: faults.len() as u64,
+        never_acted: never_acted.len() as u64,
+        repeats: episodes.repeats(),
+        ..Counts::default()
+    };
+    for summary in episodes.counted().chain(episodes.never_acted().iter().copied()) {
+        counts.proposed += u64::from(summary.candidates);
+        counts.malformed += u64::from(summary.malformed);
+        counts.decisions += summary.decision_ms.len() as u64;
+        counts.held_steps += u64::from(summary.held_steps);
+    }
+    counts
+}
+
+impl Counts {
+    fn plus(self, other: Counts) -> Counts {
+        Counts {
+            faults: self.faults + other.faults,
+            never_acted: self.never_acted + other.never_acted,
+            repeats: self.repeats + other.repeats,
+            proposed: self.proposed + other.proposed,
+            malformed: self.malformed + other.malformed,
+            decisions: self.decisions + other.decisions,
+            held_steps: self.held_steps + other.held_steps,
         }
     }
-    headroom
-}
-
-fn success(summary: &EpisodeSummary) -> f64 {
-    f64::from(u8::from(summary.statistics.is_success))
 }
 
 fn step_time(
     summaries: &[EpisodeSummary],
     of: fn(&EpisodeSummary) -> &Vec<f32>,
 ) -> Option<StepTime> {
-    let all = summaries.iter().flat_map(of);
-    let mut all: Vec<f64> = all.map(|milliseconds| f64::from(*milliseconds)).collect();
-    all.sort_by(f64::total_cmp);
-    (!all.is_empty()).then(|| StepTime { p50: quantile(&all, 0.50), p95: quantile(&all, 0.95) })
+    let sorted = sorted(summaries.iter().flat_map(of).map(|value| f64::from(*value)));
+    let time = StepTime { p50: quantile(&sorted, 0.50), p95: quantile(&sorted, 0.95) };
+    (!sorted.is_empty()).then_some(time)
+}
+
+fn median<'a>(values: impl Iterator<Item = &'a u32>) -> Option<f64> {
+    let sorted = sorted(values.map(|value| f64::from(*value)));
+    (!sorted.is_empty()).then(|| quantile(&sorted, 0.5))
+}
+
+fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use protocol::Statistics;
-    use store::record::EpisodeIdentity;
-
-    const TASKS: [&str; 2] = ["widowx_spoon_on_towel", "widowx_carrot_on_plate"];
-
-    fn order() -> Vec<TaskId> {
-        TASKS.map(TaskId::default_of).to_vec()
-    }
-
-    fn identity(task: &str, episode: u32, strategy: Strategy) -> EpisodeIdentity {
-        let setting = Setting::new(strategy, 5, 1.0);
-        EpisodeIdentity {
-            run: "run".into(),
-            task: task.into(),
-            variant: "default".into(),
-            layout: None,
-            episode,
-            seed: 3_000_000_000,
-            sampling_seed: 1,
-            strategy: setting.strategy.to_string(),
-            candidates: setting.candidates,
-            temperature: setting.temperature,
-        }
-    }
-
-    fn summary(task: &str, episode: u32, strategy: Strategy, is_success: bool) -> EpisodeSummary {
-        EpisodeSummary {
-            identity: identity(task, episode, strategy),
-            statistics: Statistics { is_success, ever_grasped: true, ..Statistics::default() },
-            simulator: "made up".into(),
-            steps: 2,
-            held_steps: 0,
-            malformed: 0,
-            candidates: 2,
-            wall_secs: 1.0,
-            decision_ms: vec![10.0, 20.0],
-            batch_size: vec![4, 8],
-            step_ms: vec![6.0, 6.0],
-            simulator_ms: vec![],
-        }
-    }
-
-    /// Sample solves a quarter, the verifier half, the oracle all of eight episodes on two tasks.
-    fn made_up() -> Vec<EpisodeSummary> {
-        let mut all = Vec::new();
-        for task in [TASKS[1], TASKS[0]] {
-            for episode in 0..4 {
-                all.push(summary(task, episode, Strategy::Sample, episode < 1));
-                all.push(summary(task, episode, Strategy::Verifier, episode < 2));
-                all.push(summary(task, episode, Strategy::Oracle, true));
-            }
-        }
-        all
-    }
-
-    #[test]
-    fn rates_gains_and_headroom_of_known_outcomes() {
-        let results = Results::new(&made_up(), &[], &order()).expect("results");
-        assert_eq!(results.tasks, order(), "the order of the options");
-        let strategies: Vec<_> =
-            results.settings.iter().map(|setting| setting.setting.strategy).collect();
-        assert_eq!(strategies, [Strategy::Sample, Strategy::Verifier, Strategy::Oracle]);
-        assert_eq!(results.settings[0].all.success, Rate { successes: 2, trials: 8 });
-        assert_eq!(results.settings[1].tasks[0].success, Rate { successes: 2, trials: 4 });
-        let [gain] = &results.gains[..] else { panic!("one comparison: {:?}", results.gains) };
-        assert_eq!(
-            (gain.better.strategy, gain.worse.strategy),
-            (Strategy::Verifier, Strategy::Sample)
-        );
-        assert_eq!((gain.gain.mean, gain.gain.pairs), (0.25, 8));
-        let [headroom] = &results.headroom[..] else {
-            panic!("one setting: {:?}", results.headroom)
-        };
-        assert!((headroom.fraction - 1.0 / 3.0).abs() < 1e-12);
-        assert_eq!(results.decision_ms.map(|time| time.p50), Some(15.0));
-        assert_eq!(results.step_ms.map(|time| time.p95), Some(6.0));
-        assert_eq!(results.simulator_ms, None, "no simulator said what it took");
-    }
-
-    #[test]
-    fn a_fault_is_counted_and_changes_no_rate() {
-        let fault = FaultRecord {
-            identity: identity(TASKS[0], 7, Strategy::Sample),
-            attempt: 1,
-            server: "s".into(),
-            reason: "lost".into(),
-            never_acted: false,
-        };
-        let results = Results::new(&made_up(), &[fault], &order()).expect("results");
-        assert_eq!(results.settings[0].tasks[0].faults, 1);
-        assert_eq!(results.settings[0].tasks[1].faults, 0);
-        assert_eq!(results.settings[0].all.success, Rate { successes: 2, trials: 8 });
-    }
-
-    #[test]
-    fn only_common_episodes_are_paired() {
-        let mut summaries = made_up();
-        summaries.push(summary(TASKS[0], 9, Strategy::Verifier, true));
-        let results = Results::new(&summaries, &[], &order()).expect("results");
-        assert_eq!(results.gains[0].gain.pairs, 8);
-        // Without any pair in one task there is no average over all tasks.
-        summaries.retain(|one| {
-            one.identity.task != TASKS[1] || one.identity.strategy != Strategy::Sample.name()
-        });
-        assert!(Results::new(&summaries, &[], &order()).expect("results").gains.is_empty());
-    }
-}
+mod tests;

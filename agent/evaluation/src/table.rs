@@ -1,76 +1,135 @@
-//! The tables that a terminal shows: success of every setting on every task, gains, success against N.
+//! The tables that a terminal shows, each with a sentence that says what to see in it.
 
-use std::fmt::Write;
-
-use crate::results::{Rates, Results, SettingResult, StepTime};
-use crate::statistics::Rate;
+use comfy_table::{CellAlignment, Table, presets};
 use decision::Strategy;
 
-/// All tables, one after the other. Every percentage carries its number of episodes or its interval.
+use crate::estimate::Rate;
+use crate::headline::Headline;
+use crate::results::{Counts, Results, SettingResult, StepTime};
+use crate::statistics::Interval;
+
+/// The headline and all tables, one after the other. Every percentage has its interval or its number of episodes.
 pub fn text(results: &Results) -> String {
-    let parts = [rates(results), gains(results), by_candidates(results), times(results)];
+    let headline =
+        Headline::new(results).map_or_else(String::new, |one| one.text().trim().to_owned() + "\n");
+    let parts = [
+        headline,
+        averages(results),
+        tasks(results),
+        gains(results),
+        headroom(results),
+        by_candidates(results),
+        counts(results),
+        times(results),
+    ];
     parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
 }
 
-/// One block per task and one for all: SIMPLER's result first, the other readings of success beside it.
-fn rates(results: &Results) -> String {
-    let mut rows = vec![
-        ["", "success %", "95 %", "grasp %", "95 %", "any step %", "released %", "n", "faults"]
-            .map(str::to_owned)
-            .to_vec(),
-    ];
-    let blocks =
-        results.tasks.iter().enumerate().map(|(index, task)| (task.to_string(), Some(index)));
-    for (title, index) in blocks.chain([("average".to_owned(), None)]) {
-        rows.push(vec![title]);
-        for result in &results.settings {
-            rows.push(rate_row(result, index.map_or(&result.all, |index| &result.tasks[index])));
-        }
+/// A title, the table below it, and what to see in it; nothing without rows.
+fn titled(title: &str, head: &[&str], rows: Vec<Vec<String>>, note: &str) -> String {
+    if rows.is_empty() {
+        return String::new();
     }
-    aligned(&rows)
+    let head = head.iter().map(|name| (*name).to_owned()).collect();
+    let rows: Vec<Vec<String>> = std::iter::once(head).chain(rows).collect();
+    let note = if note.is_empty() { String::new() } else { format!("{note}\n") };
+    format!("{title}\n{}{note}", aligned(&rows))
 }
 
-fn rate_row(result: &SettingResult, rates: &Rates) -> Vec<String> {
-    vec![
-        format!("  {}", result.setting),
-        percent(rates.success),
-        interval(rates.success),
-        percent(rates.grasped),
-        interval(rates.grasped),
-        percent(rates.ever_success),
-        percent(rates.released_success),
-        rates.success.trials.to_string(),
-        rates.faults.to_string(),
-    ]
+fn averages(results: &Results) -> String {
+    let row = |result: &SettingResult| {
+        vec![
+            format!("  {}", result.setting),
+            with_interval(result.all.success),
+            percent(result.all.ever_success),
+            percent(result.all.released_success),
+            percent(result.all.grasped),
+            episodes(result.all.success),
+        ]
+    };
+    let clustered =
+        results.settings.iter().any(|one| one.all.success.episodes > one.all.success.starts);
+    let note = match clustered {
+        true => {
+            "  Episodes that share an initial layout are a cluster: the interval is as wide as that makes it."
+        }
+        false => "",
+    };
+    titled(
+        "Success in % of episodes, averaged over tasks, each of which counts the same; 95 % intervals",
+        &["", "at the last step", "at any step", "released", "ever grasped", "episodes"],
+        results.settings.iter().map(row).collect(),
+        note,
+    )
+}
+
+fn tasks(results: &Results) -> String {
+    if results.tasks.len() < 2 {
+        return String::new();
+    }
+    let mut rows = Vec::new();
+    for (index, task) in results.tasks.iter().enumerate() {
+        rows.push(vec![format!("  {task}")]);
+        for result in &results.settings {
+            let of_task = &result.tasks[index];
+            rows.push(vec![
+                format!("    {}", result.setting),
+                with_interval(of_task.success),
+                percent(of_task.released_success),
+                percent(of_task.grasped),
+                malformed(of_task.counts),
+                episodes(of_task.success),
+            ]);
+        }
+    }
+    titled(
+        "Success per task in % of episodes, and malformed candidates in % of all",
+        &["", "at the last step", "released", "ever grasped", "malformed", "episodes"],
+        rows,
+        "",
+    )
 }
 
 fn gains(results: &Results) -> String {
-    if results.gains.is_empty() {
-        return String::new();
-    }
-    let mut rows =
-        vec![["gain in points, paired", "", "95 %", "pairs"].map(str::to_owned).to_vec()];
-    for gain in &results.gains {
-        let interval = gain.gain.interval;
-        rows.push(vec![
-            format!("  {} over {}", gain.better, gain.worse),
-            format!("{:+.1}", 100.0 * gain.gain.mean),
-            format!("[{:+.1}, {:+.1}]", 100.0 * interval.low, 100.0 * interval.high),
-            gain.gain.pairs.to_string(),
-        ]);
-    }
-    for headroom in &results.headroom {
-        let title =
-            format!("  {}: part of the way from one sample to the oracle", headroom.setting);
-        rows.push(vec![title, format!("{:.0} %", 100.0 * headroom.fraction)]);
-    }
-    aligned(&rows)
+    let rows = results.gains.iter().map(|one| {
+        let gain = &one.gain;
+        vec![
+            format!("  {} minus {}", one.better, one.worse),
+            format!("{:+.1}", 100.0 * gain.mean),
+            signed(gain.interval),
+            gain.pairs.to_string(),
+        ]
+    });
+    titled(
+        "Gains in percentage points, on the same initial layouts with the same random numbers",
+        &["", "gain", "95 %", "pairs"],
+        rows.collect(),
+        "  An interval that includes 0 leaves open which of the two is better.",
+    )
 }
 
-/// Where a strategy ran with several numbers of candidates; one sample is its first point.
+fn headroom(results: &Results) -> String {
+    let rows = results.headroom.iter().map(|one| {
+        let headroom = &one.headroom;
+        vec![
+            format!("  {}", one.setting),
+            format!("{:.0} %", 100.0 * headroom.fraction),
+            headroom.interval.map_or_else(|| "open".to_owned(), rounded),
+            headroom.episodes.to_string(),
+        ]
+    });
+    titled(
+        "Headroom: share of the gap between a single sample and the oracle that a setting closes",
+        &["", "share", "95 %", "episodes"],
+        rows.collect(),
+        "  The oracle executes the candidate nearest to the scripted expert's action.\n  Open: the oracle may be no \
+         better than a single sample.",
+    )
+}
+
+/// Where a strategy ran with several numbers of candidates; a single sample is its first point.
 fn by_candidates(results: &Results) -> String {
-    let mut rows =
-        vec![["success against N", "N", "success %", "95 %"].map(str::to_owned).to_vec()];
+    let mut rows = Vec::new();
     for strategy in Strategy::ALL {
         let of_strategy = |result: &&SettingResult| result.setting.strategy == strategy;
         let mut temperatures: Vec<f32> = results
@@ -89,74 +148,103 @@ fn by_candidates(results: &Results) -> String {
             if points.iter().filter(|result| of_strategy(result)).count() < 2 {
                 continue;
             }
-            for point in points {
-                rows.push(vec![
+            rows.extend(points.into_iter().map(|point| {
+                vec![
                     format!("  {strategy} T={temperature}"),
                     point.setting.candidates.to_string(),
-                    percent(point.all.success),
-                    interval(point.all.success),
-                ]);
-            }
+                    with_interval(point.all.success),
+                ]
+            }));
         }
     }
-    if rows.len() == 1 { String::new() } else { aligned(&rows) }
+    titled("Success against the number of candidates N", &["", "N", "at the last step"], rows, "")
 }
 
-fn interval(rate: Rate) -> String {
-    let interval = rate.interval();
-    format!("[{:.1}, {:.1}]", 100.0 * interval.low, 100.0 * interval.high)
+fn counts(results: &Results) -> String {
+    let row = |result: &SettingResult| {
+        let Counts { faults, never_acted, repeats, proposed, malformed, decisions, held_steps } =
+            result.all.counts;
+        vec![
+            format!("  {}", result.setting),
+            format!("{malformed} of {proposed}"),
+            format!("{held_steps} of {decisions}"),
+            never_acted.to_string(),
+            faults.to_string(),
+            repeats.to_string(),
+        ]
+    };
+    titled(
+        "Beside the rates",
+        &["", "malformed candidates", "held steps", "never acted", "faults", "repeats"],
+        results.settings.iter().map(row).collect(),
+        "  Malformed candidates are never executed; without a well-formed one the robot holds still.\n  Episodes in which \
+         the policy never acted and attempts that broke (faults) have no outcome.\n  Repeats of an episode in which \
+         nothing is drawn count once.",
+    )
 }
 
 fn times(results: &Results) -> String {
+    let batch =
+        results.batch_size.map_or_else(String::new, |size| format!(" (batches of {size:.0})"));
     let times = [
-        ("  decision of a whole batch", results.decision_ms),
-        ("  control step after it", results.step_ms),
-        ("    its simulator's part", results.simulator_ms),
+        (format!("  decision{batch}"), results.decision_ms),
+        ("  control step after it".to_owned(), results.step_ms),
+        ("    of that, the simulator".to_owned(), results.simulator_ms),
     ];
-    let mut rows = vec![["milliseconds", "p50", "p95"].map(str::to_owned).to_vec()];
-    for (what, time) in times {
-        if let Some(StepTime { p50, p95 }) = time {
-            rows.push(vec![what.to_owned(), format!("{p50:.1}"), format!("{p95:.1}")]);
-        }
+    let rows = times.into_iter().filter_map(|(what, time)| {
+        let StepTime { p50, p95 } = time?;
+        Some(vec![what, format!("{p50:.1}"), format!("{p95:.1}")])
+    });
+    titled("Milliseconds", &["", "median", "p95"], rows.collect(), "")
+}
+
+/// How many episodes a rate is over, and over how many initial layouts where these are fewer.
+fn episodes(rate: Rate) -> String {
+    match rate.episodes == rate.starts {
+        true => rate.episodes.to_string(),
+        false => format!("{} on {} layouts", rate.episodes, rate.starts),
     }
-    if rows.len() == 1 { String::new() } else { aligned(&rows) }
 }
 
 fn percent(rate: Rate) -> String {
-    rate.value().map_or_else(|| "-".to_owned(), |value| format!("{:.1}", 100.0 * value))
+    rate.value.map_or_else(|| "-".to_owned(), |value| format!("{:.1}", 100.0 * value))
+}
+
+fn malformed(counts: Counts) -> String {
+    match counts.proposed {
+        0 => "-".to_owned(),
+        proposed => format!("{:.1}", 100.0 * counts.malformed as f64 / proposed as f64),
+    }
+}
+
+fn with_interval(rate: Rate) -> String {
+    let Interval { low, high } = rate.interval;
+    format!("{} [{:.1}, {:.1}]", percent(rate), 100.0 * low, 100.0 * high)
+}
+
+fn signed(interval: Interval) -> String {
+    format!("[{:+.1}, {:+.1}]", 100.0 * interval.low, 100.0 * interval.high)
+}
+
+fn rounded(interval: Interval) -> String {
+    format!("[{:.0}, {:.0}]", 100.0 * interval.low, 100.0 * interval.high)
 }
 
 /// The first column to the left, the others to the right.
 pub fn aligned(rows: &[Vec<String>]) -> String {
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let cells = |column: usize| rows.iter().filter_map(move |row| row.get(column));
-    let widths: Vec<usize> = (0..columns)
-        .map(|column| cells(column).map(|cell| cell.chars().count()).max().unwrap_or(0))
-        .collect();
-    let mut text = String::new();
-    for row in rows {
-        let mut line = String::new();
-        for (column, (cell, width)) in row.iter().zip(&widths).enumerate() {
-            // Writing to a string cannot fail.
-            let _ = match column {
-                0 => write!(line, "{cell:width$}"),
-                _ => write!(line, "  {cell:>width$}"),
-            };
-        }
-        text.push_str(line.trim_end());
-        text.push('\n');
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING).add_rows(rows);
+    for (index, column) in table.column_iter_mut().enumerate() {
+        // Two spaces between columns, none before the first.
+        column.set_padding((if index == 0 { 0 } else { 2 }, 0));
+        column.set_cell_alignment(if index == 0 {
+            CellAlignment::Left
+        } else {
+            CellAlignment::Right
+        });
     }
-    text
+    table.trim_fmt() + "\n"
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn columns_are_aligned_whatever_they_hold() {
-        let rows = [vec!["a", "success %"], vec!["title"], vec!["  longer", "–", "9"]];
-        let rows = rows.map(|row| row.into_iter().map(str::to_owned).collect::<Vec<_>>());
-        assert_eq!(aligned(&rows), "a         success %\ntitle\n  longer          –  9\n");
-    }
-}
+mod tests;

@@ -8,6 +8,8 @@ use serde::Serialize;
 use store::run::EpisodeSummary;
 use store::video::FRAMES_PER_SECOND;
 
+use crate::counted::never_acted;
+
 /// What `data/catalogue.js` holds.
 #[derive(Serialize)]
 pub struct Catalogue {
@@ -34,15 +36,16 @@ pub struct Entry {
 }
 
 impl Catalogue {
-    /// Lists all episodes; at most `details_max` of them come with their steps.
+    /// Lists all episodes, task by task in the given order; at most `details_max` of them come with their steps.
     pub fn new(
         summaries: &[EpisodeSummary],
+        tasks: &[TaskId],
         has_video: impl Fn(&str) -> bool,
         details_max: usize,
     ) -> Self {
         let mut pairs = BTreeMap::new();
         let mut episodes: Vec<Entry> = Vec::with_capacity(summaries.len());
-        for summary in in_order(summaries) {
+        for summary in in_order(summaries, tasks) {
             let identity = &summary.identity;
             let place = (&identity.task, &identity.variant, identity.episode);
             let count = pairs.len();
@@ -85,12 +88,13 @@ pub fn task_words(id: &TaskId) -> String {
 }
 
 /// Layouts in order of their numbers, the settings of one layout together.
-fn in_order(summaries: &[EpisodeSummary]) -> Vec<&EpisodeSummary> {
+fn in_order<'a>(summaries: &'a [EpisodeSummary], tasks: &[TaskId]) -> Vec<&'a EpisodeSummary> {
     let mut ordered: Vec<&EpisodeSummary> = summaries.iter().collect();
     ordered.sort_by(|a, b| {
         let key = |summary: &EpisodeSummary| {
             let identity = &summary.identity;
-            (identity.task.clone(), identity.variant.clone(), identity.episode, identity.id())
+            let task = tasks.iter().position(|task| *task == identity.task_id());
+            (task, identity.episode, identity.id())
         };
         key(a).cmp(&key(b))
     });
@@ -114,9 +118,12 @@ fn place_in_task(episodes: &[Entry], index: usize) -> usize {
     episodes[index].pair - first.map_or(0, |first| episodes[first].pair)
 }
 
-/// What became of an episode, told by its last step and by what it had reached before.
+/// What became of an episode, told by its last step and by what it had reached before; `none` where the policy never acted.
 fn outcome(summary: &EpisodeSummary) -> &'static str {
     let statistics = &summary.statistics;
+    if never_acted(summary) {
+        return "none";
+    }
     match (statistics.is_success, statistics.ever_success, statistics.ever_grasped) {
         (true, _, _) => "success",
         (false, true, _) => "lost",
@@ -131,12 +138,14 @@ mod tests {
     use crate::report::sample;
 
     #[test]
-    fn arms_of_one_placement_share_a_pair_and_videos_come_first() {
+    fn settings_of_one_layout_share_a_pair_and_videos_come_first() {
         let summaries = sample::summaries();
+        let order = [sample::TASKS[1], sample::TASKS[0]].map(TaskId::default_of);
         let with_video = summaries[5].identity.id();
-        let catalogue = Catalogue::new(&summaries, |id| id == with_video, 3);
+        let catalogue = Catalogue::new(&summaries, &order, |id| id == with_video, 3);
         assert_eq!(catalogue.episodes.len(), summaries.len());
         assert_eq!(catalogue.detailed().len(), 3);
+        assert_eq!(catalogue.episodes[0].task, "stack cube", "the order of the run");
         assert!(catalogue.detailed().contains(with_video.as_str()));
         for one in &catalogue.episodes {
             for other in &catalogue.episodes {
@@ -144,6 +153,14 @@ mod tests {
                 assert_eq!(same, one.pair == other.pair, "{} and {}", one.id, other.id);
             }
         }
+    }
+
+    #[test]
+    fn an_episode_in_which_the_policy_never_acted_has_no_outcome() {
+        let mut summary = sample::summaries().remove(0);
+        assert_ne!(outcome(&summary), "none");
+        summary.held_steps = summary.decision_ms.len() as u32;
+        assert_eq!(outcome(&summary), "none");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The forest plot: paired gains in points with their intervals, one line per comparison.
+//! The forest plot: paired gains in percentage points with their intervals, one line per comparison.
 
 use std::fmt::Write;
 
@@ -16,9 +16,9 @@ pub struct Comparison {
 
 const WIDTH: f64 = 860.0;
 const LABELS: f64 = 300.0;
-const VALUES: f64 = 190.0;
+const VALUES: f64 = 215.0;
 const ROW: f64 = 26.0;
-/// Points that the axis shows at least on either side of zero.
+/// Percentage points that the axis shows at least on either side of zero.
 const SPAN_MIN: f64 = 5.0;
 
 /// The figure, or nothing when there is nothing to compare.
@@ -64,7 +64,7 @@ pub fn figure(comparisons: &[Comparison]) -> String {
              <line class=\"whisker\" x1=\"{:.1}\" x2=\"{:.1}\" y1=\"{middle:.1}\" y2=\"{middle:.1}\"/>\
              <circle cx=\"{:.1}\" cy=\"{middle:.1}\" r=\"5\"/>\
              <text class=\"value\" x=\"{:.1}\" y=\"{:.1}\">{gain:+.1} [{low:+.1}, {high:+.1}] \
-             <tspan class=\"muted\">n {}</tspan></text></g>",
+             <tspan class=\"muted\">{} pairs</tspan></text></g>",
             LABELS - 14.0,
             middle + 4.0,
             escape::html(&one.label),

@@ -18,6 +18,7 @@ mod curve;
 mod details;
 mod escape;
 mod forest;
+mod head;
 mod page;
 #[cfg(test)]
 pub(crate) mod sample;
@@ -85,7 +86,9 @@ pub fn build(
     let name = options.run.display();
     ensure!(!summaries.is_empty(), "the run {name} has no finished episode to report");
     let has_video = |id: &str| run::video_path(options.run, id).is_file();
-    let catalogue = Catalogue::new(&summaries, has_video, options.episodes_max);
+    let results =
+        Results::new(&summaries, &run::faults(options.run)?, &tasks_in_order(&header.options))?;
+    let catalogue = Catalogue::new(&summaries, &results.tasks, has_video, options.episodes_max);
     let mut folder = Folder::new(options.out)?;
     let detailed = catalogue.detailed();
     let mut scored = Vec::new();
@@ -93,7 +96,9 @@ pub fn build(
     for (done, entry) in catalogue.episodes.iter().enumerate() {
         progress(done, catalogue.episodes.len());
         let record = EpisodeRecord::read(&run::record_path(options.run, &entry.id))?;
-        scored.extend(chosen_scores(&record)?);
+        if results.counted.contains(&entry.id) {
+            scored.extend(chosen_scores(&record)?);
+        }
         simulators.insert(record.versions.simulator.clone());
         if detailed.contains(entry.id.as_str()) {
             let details = Details::new(&record, speak)?;
@@ -107,8 +112,6 @@ pub fn build(
     for (name, text) in page::FILES {
         folder.write(name, text.as_bytes())?;
     }
-    let results =
-        Results::new(&summaries, &run::faults(options.run)?, &tasks_in_order(&header.options))?;
     folder.write(
         "index.html",
         sections::page(&header, &simulators, &results, &scored).html()?.as_bytes(),

@@ -16,7 +16,7 @@ use store::record::{
 use store::run::{EpisodeSummary, Run};
 use store::video::Video;
 
-const TASKS: [&str; 2] = ["widowx_spoon_on_towel", "widowx_stack_cube"];
+pub const TASKS: [&str; 2] = ["widowx_spoon_on_towel", "widowx_stack_cube"];
 const SETTINGS: [(&str, u32); 3] = [("greedy", 1), ("sample", 1), ("verifier", 5)];
 const EPISODES: u32 = 4;
 const STEPS: usize = 60;

@@ -1,7 +1,10 @@
 //! The sections of the page: what the numbers of a run look like in words, tables and figures.
+
 use std::collections::BTreeSet;
 
+use decision::{Strategy, TaskId};
 use serde_json::Value;
+use store::run::RunHeader;
 
 use super::bars::Bar;
 use super::catalogue::task_words;
@@ -10,15 +13,12 @@ use super::escape::html;
 use super::forest::Comparison;
 use super::page::Page;
 use super::scores::{Bin, Scored};
-use super::{bars, curve, forest, scores};
+use super::{bars, curve, forest, head, scores};
 use crate::calibration;
-use crate::results::{Rates, Results, SettingGain, SettingResult, StepTime};
-use crate::statistics::{Rate, auroc};
-use decision::{Strategy, TaskId};
-use store::run::RunHeader;
-
-/// A digest is known by its beginning.
-const VERSION_LETTERS: usize = 16;
+use crate::comparisons::{SettingGain, SettingHeadroom};
+use crate::estimate::Rate;
+use crate::results::{Counts, Results, SettingResult};
+use crate::statistics::auroc;
 
 /// The whole page of a run.
 pub fn page(
@@ -39,7 +39,7 @@ pub fn page(
     let links = shown().map(|(id, _, _)| format!("<a href=\"#{id}\">{id}</a>"));
     Page {
         title: format!("{} · rever", html(&header.run)),
-        header: head(header, simulators, results),
+        header: head::head(header, simulators, results),
         links: links.collect(),
         sections: shown()
             .map(|(id, title, body)| {
@@ -50,95 +50,9 @@ pub fn page(
     }
 }
 
-fn head(header: &RunHeader, simulators: &BTreeSet<String>, results: &Results) -> String {
-    let episodes: u64 = results.settings.iter().map(|setting| setting.all.success.trials).sum();
-    let faults: u64 = results.settings.iter().map(|setting| setting.all.faults).sum();
-    let mut facts = vec![("episodes", episodes.to_string()), ("faults", faults.to_string())];
-    let times = [
-        ("a decision takes", results.decision_ms),
-        ("a step takes", results.step_ms),
-        ("its simulator takes", results.simulator_ms),
-    ];
-    for (what, StepTime { p50, p95 }) in
-        times.into_iter().filter_map(|(what, time)| Some((what, time?)))
-    {
-        facts.push((what, format!("{p50:.1} ms (p95 {p95:.1} ms)")));
-    }
-    let simulators: Vec<&str> = simulators.iter().map(String::as_str).collect();
-    facts.push(("simulator", simulators.join(", ")));
-    for name in ["policy", "verifier"] {
-        if let Some(version) = header.versions.get(name).and_then(Value::as_str) {
-            facts.push((name, version.chars().take(VERSION_LETTERS).collect()));
-        }
-    }
-    let facts: String = facts.iter().map(|(name, value)| fact(name, value)).collect();
-    format!(
-        "<h1>{}</h1><p class=\"headline\">{}</p><dl class=\"facts\">{facts}</dl>\
-         <details><summary>options and versions</summary><dl class=\"facts\">{}{}</dl></details>",
-        html(&header.run),
-        headline(results),
-        facts_of(&header.options),
-        facts_of(&header.versions),
-    )
-}
-
-fn fact(name: &str, value: &str) -> String {
-    format!("<div><dt>{}</dt><dd>{}</dd></div>", html(name), html(value))
-}
-
-fn facts_of(value: &Value) -> String {
-    let Value::Object(fields) = value else { return fact("value", &value.to_string()) };
-    let plain = |value: &Value| match value {
-        Value::String(text) => text.clone(),
-        Value::Array(list) => list.iter().map(plain_item).collect::<Vec<_>>().join(", "),
-        other => other.to_string(),
-    };
-    fields.iter().map(|(name, value)| fact(name, &plain(value))).collect()
-}
-
-fn plain_item(value: &Value) -> String {
-    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
-}
-
-/// One sentence: the verifier against one sample, or the first setting alone.
-fn headline(results: &Results) -> String {
-    let main = results.gains.iter().find(|gain| {
-        gain.better.strategy == Strategy::Verifier && gain.worse.strategy == Strategy::Sample
-    });
-    let setting = |setting| results.settings.iter().find(|result| result.setting == setting);
-    let Some(main) = main else {
-        return results.settings.first().map_or_else(String::new, |first| {
-            format!(
-                "{} succeeds in {}.",
-                html(&first.setting.to_string()),
-                percent(first.all.success)
-            )
-        });
-    };
-    let (Some(better), Some(worse)) = (setting(main.better), setting(main.worse)) else {
-        return String::new();
-    };
-    let class = if main.gain.mean < 0.0 { " class=\"worse\"" } else { "" };
-    format!(
-        "The verifier’s choice of {} succeeds in {}, one sample at the same temperature in {}: a paired \
-         gain of <b{class}>{:+.1} points</b> (95 % interval {:+.1} to {:+.1}, {} pairs).",
-        main.better.candidates,
-        percent(better.all.success),
-        percent(worse.all.success),
-        main.gain.mean * 100.0,
-        main.gain.interval.low * 100.0,
-        main.gain.interval.high * 100.0,
-        main.gain.pairs
-    )
-}
-
-fn percent(rate: Rate) -> String {
-    rate.value().map_or_else(|| "–".to_owned(), |value| format!("{:.1} %", value * 100.0))
-}
-
 fn percent_with_interval(rate: Rate) -> String {
-    let Some(value) = rate.value() else { return "–".to_owned() };
-    let interval = rate.interval();
+    let Some(value) = rate.value else { return "–".to_owned() };
+    let interval = rate.interval;
     format!(
         "{:.1}<small>{:.1}–{:.1}</small>",
         value * 100.0,
@@ -148,44 +62,80 @@ fn percent_with_interval(rate: Rate) -> String {
 }
 
 fn result(results: &Results) -> String {
-    let heads: String =
-        results.tasks.iter().map(|task| format!("<th>{}</th>", html(&task_words(task)))).collect();
-    let rows: String = results.settings.iter().map(row).collect();
+    let rates: String = results.settings.iter().map(rates).collect();
+    let counts: String = results.settings.iter().map(counts).collect();
     format!(
-        "<p class=\"note\">Percent of episodes with 95 % Wilson intervals. Success is read at the last \
-         step; the columns on the right count, over all tasks, success at any step, success with the \
-         object let go, and episodes in which the object was held at some step.</p>\
-         <div class=\"scroll\"><table><thead><tr><th>strategy</th><th>success</th>{heads}\
-         <th>at any step</th><th>released</th><th>grasp</th><th>n</th><th>faults</th></tr></thead>\
-         <tbody>{rows}</tbody></table></div>"
+        "<p class=\"note\">Percent of episodes with 95 % intervals, averaged over tasks, each of which counts the \
+         same. Success is read at the last step; the columns beside it count success at any step, success with the \
+         object released, and episodes in which the object was held at some step. Episodes that share an initial \
+         layout are a cluster, which widens the interval.</p>{}\
+         <p class=\"note\">Beside the rates: malformed candidates are never executed, and without a well-formed one \
+         the robot holds still. Episodes in which the policy never acted and attempts that broke (faults) have no \
+         outcome; repeats of an episode in which nothing is drawn count once.</p>{}",
+        table(
+            &["setting", "success", "at any step", "released", "ever grasped", "episodes"],
+            &rates
+        ),
+        table(
+            &["setting", "malformed candidates", "held steps", "never acted", "faults", "repeats"],
+            &counts
+        ),
     )
 }
 
-fn row(result: &SettingResult) -> String {
-    let Rates { grasped, success, ever_success, released_success, faults } = result.all;
-    let tasks: String = result.tasks.iter().map(|task| cell(task.success)).collect();
-    let class = if faults > 0 { " class=\"fault\"" } else { "" };
+fn table(heads: &[&str], rows: &str) -> String {
+    let heads: String = heads.iter().map(|head| format!("<th>{head}</th>")).collect();
     format!(
-        "<tr data-strategy=\"{}\"><td>{}</td><td class=\"main\">{}</td>{tasks}{}{}{}<td>{}</td>\
-         <td{class}>{faults}</td></tr>",
-        result.setting.strategy,
-        html(&result.setting.to_string()),
-        percent_with_interval(success),
-        cell(ever_success),
-        cell(released_success),
-        cell(grasped),
-        success.trials
+        "<div class=\"scroll\"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
     )
 }
 
-fn cell(rate: Rate) -> String {
-    format!("<td>{}</td>", percent_with_interval(rate))
+/// A row of a table over settings; cells are HTML already.
+fn row(result: &SettingResult, cells: &[String]) -> String {
+    let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
+    let setting = result.setting;
+    format!(
+        "<tr data-strategy=\"{}\"><td>{}</td>{cells}</tr>",
+        setting.strategy,
+        html(&setting.to_string())
+    )
+}
+
+fn rates(result: &SettingResult) -> String {
+    let all = &result.all;
+    let Rate { episodes, starts, .. } = all.success;
+    let rates = [all.success, all.ever_success, all.released_success, all.grasped];
+    let mut cells: Vec<String> = rates.into_iter().map(percent_with_interval).collect();
+    cells[0] = format!("<b>{}</b>", cells[0]);
+    cells.push(match episodes == starts {
+        true => episodes.to_string(),
+        false => format!("{episodes}<small>{starts} layouts</small>"),
+    });
+    row(result, &cells)
+}
+
+fn counts(result: &SettingResult) -> String {
+    let Counts { faults, never_acted, repeats, proposed, malformed, decisions, held_steps } =
+        result.all.counts;
+    let share = |part: u64, whole: u64| format!("{part}<small>of {whole}</small>");
+    let alarming = |count: u64| match count {
+        0 => count.to_string(),
+        count => format!("<span class=\"fault\">{count}</span>"),
+    };
+    let cells = [
+        share(malformed, proposed),
+        share(held_steps, decisions),
+        alarming(never_acted),
+        alarming(faults),
+        repeats.to_string(),
+    ];
+    row(result, &cells)
 }
 
 fn gains(results: &Results) -> String {
     let comparison = |gain: &SettingGain| Comparison {
         label: format!("{} − {}", gain.better, gain.worse),
-        episodes: gain.gain.pairs,
+        episodes: gain.gain.pairs as usize,
         gain: gain.gain.mean,
         low: gain.gain.interval.low,
         high: gain.gain.interval.high,
@@ -195,21 +145,33 @@ fn gains(results: &Results) -> String {
     if figure.is_empty() {
         return figure;
     }
-    let headroom: Vec<String> = results
-        .headroom
-        .iter()
-        .map(|one| format!("{} {:.0} %", html(&one.setting.to_string()), one.fraction * 100.0))
-        .collect();
+    let headroom: Vec<String> = results.headroom.iter().map(headroom).collect();
     let headroom = match headroom.is_empty() {
         true => String::new(),
         false => format!(
-            "<p class=\"note\">Part of the way from one sample to the oracle: {}.</p>",
+            "<p class=\"note\">Headroom, the share of the gap between a single sample and the oracle that a setting \
+             closes: {}.</p>",
             headroom.join(", ")
         ),
     };
     format!(
-        "<p class=\"note\">Points of success on the same layouts with the same random numbers, \
-         averaged over tasks; 95 % paired bootstrap intervals.</p>{figure}{headroom}"
+        "<p class=\"note\">Percentage points of success on the same initial layouts with the same random numbers, \
+         averaged over tasks, with 95 % intervals. An interval that includes 0 leaves open which of the two is \
+         better.</p>{figure}{headroom}"
+    )
+}
+
+fn headroom(one: &SettingHeadroom) -> String {
+    let headroom = &one.headroom;
+    let interval = headroom.interval.map_or_else(
+        || "no interval: the oracle may be no better than a single sample".to_owned(),
+        |interval| format!("{:.0} to {:.0}", interval.low * 100.0, interval.high * 100.0),
+    );
+    format!(
+        "{} {:.0} % ({interval}, {} episodes)",
+        html(&one.setting.to_string()),
+        headroom.fraction * 100.0,
+        headroom.episodes
     )
 }
 
@@ -219,7 +181,7 @@ fn candidates(results: &Results) -> String {
         let (strategy, temperature) = (result.setting.strategy, result.setting.temperature);
         let known = series.iter().position(|(a, b, _)| (*a, *b) == (strategy, temperature));
         let place = known.unwrap_or_else(|| {
-            // Choosing from one candidate is taking one sample, so every line begins there.
+            // Choosing from one candidate is taking a single sample, so every line begins there.
             let is_start = |one: &&SettingResult| {
                 one.setting.strategy == Strategy::Sample && one.setting.temperature == temperature
             };
@@ -231,23 +193,23 @@ fn candidates(results: &Results) -> String {
         });
         series[place].2.points.extend(point(result));
     }
-    // A line needs a second number of candidates beside the one sample that all share.
+    // A line needs a second number of candidates beside the single sample that all share.
     series.retain(|(_, _, one)| one.points.iter().filter(|point| point.candidates > 1).count() > 1);
     let figure = curve::figure(&series.into_iter().map(|(_, _, one)| one).collect::<Vec<_>>());
     if figure.is_empty() {
         return figure;
     }
     format!(
-        "<p class=\"note\">Success at the last step over all tasks, with 95 % Wilson intervals; one \
-         candidate is one sample.</p>{figure}"
+        "<p class=\"note\">Success at the last step, averaged over tasks, with 95 % intervals; one candidate is a \
+         single sample.</p>{figure}"
     )
 }
 
 fn point(result: &SettingResult) -> Option<Point> {
-    let interval = result.all.success.interval();
+    let interval = result.all.success.interval;
     Some(Point {
         candidates: result.setting.candidates as usize,
-        rate: result.all.success.value()?,
+        rate: result.all.success.value?,
         low: interval.low,
         high: interval.high,
     })
@@ -317,13 +279,13 @@ fn tasks(results: &Results) -> String {
 }
 
 fn bar(result: &SettingResult, rate: Rate) -> Option<Bar> {
-    let interval = rate.interval();
+    let interval = rate.interval;
     Some(Bar {
         label: result.setting.to_string(),
         strategy: result.setting.strategy.to_string(),
-        rate: rate.value()?,
+        rate: rate.value?,
         low: interval.low,
         high: interval.high,
-        episodes: rate.trials as usize,
+        episodes: rate.episodes as usize,
     })
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::{Report, ReportOptions, build, sample};
+use super::{Report, ReportOptions, build, chosen_scores, details::Details, sample};
 
 fn built(run: &Path, out: &Path, episodes_max: usize) -> Report {
     let options = ReportOptions { run, out, episodes_max };
@@ -130,4 +130,52 @@ fn a_run_without_episodes_is_refused_in_words() {
     let options = ReportOptions { run: &run, out: folder.path(), episodes_max: 1 };
     let error = build(&options, &sample::speak, &|_, _| ()).expect_err("no run");
     assert!(error.to_string().contains("is not a run"), "{error:#}");
+}
+
+#[test]
+fn a_score_is_selected_only_where_the_strategy_looked_at_the_candidates() {
+    let record = sample::records().into_iter().find(|one| one.identity.candidates == 5);
+    let mut record = record.expect("a record with five candidates");
+    for (strategy, expected) in
+        [("verifier", true), ("sample", false), ("first-well-formed", false)]
+    {
+        record.identity.strategy = strategy.into();
+        let scored = chosen_scores(&record).expect("scores");
+        assert!(!scored.is_empty());
+        assert!(scored.iter().all(|one| one.is_selected == expected), "{strategy} of five");
+    }
+}
+
+#[test]
+fn chunks_and_policies_without_text_are_shown_as_they_are() {
+    let mut record = sample::records().remove(0);
+    record.steps.truncate(2);
+    let chunk = vec![vec![0.5, -0.25], vec![0.125, 1.0]];
+    let candidates = &mut record.steps[0].decision.as_mut().expect("a decision").candidates;
+    candidates[0].tokens.clear();
+    candidates[0].actions = Some(chunk.clone().try_into().expect("a chunk"));
+    candidates[0].malformed = None;
+    record.steps[1].decision = None;
+    let details =
+        Details::new(&record, &|_| panic!("there are no tokens to read")).expect("details");
+    let shown = serde_json::to_value(&details).expect("JSON");
+    assert_eq!(shown["steps"][0]["candidates"][0]["actions"], serde_json::json!(chunk));
+    assert_eq!(shown["steps"][1]["decision_ms"], Value::Null);
+    assert_eq!(shown["steps"][1]["candidates"], serde_json::json!([]));
+}
+
+#[test]
+fn the_page_tells_malformed_candidates_and_held_steps_of_every_setting() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (run, out) = (folder.path().join("run"), folder.path().join("report"));
+    sample::write(&run).expect("run");
+    built(&run, &out, 1);
+    let page = std::fs::read_to_string(out.join("index.html")).expect("page");
+    let malformed: usize = sample::summaries().iter().map(|one| one.malformed as usize).sum();
+    assert!(page.contains(&format!("<dt>malformed candidates</dt><dd>{malformed}</dd>")), "{page}");
+    for setting in ["greedy", "sample T=1", "verifier N=5 T=1"] {
+        let rows = page.matches(&format!("<td>{setting}</td>")).count();
+        assert_eq!(rows, 2, "rates and counts of {setting}");
+    }
+    assert!(page.contains("21.5 ms in batches of 4"), "a decision's own time");
 }

@@ -4,7 +4,7 @@
 (() => {
   const catalogue = window.reverCatalogue;
   const ROWS_AT_ONCE = 200;
-  const MARKS = { success: "✓", lost: "◐", grasped: "○", failure: "✗" };
+  const MARKS = { success: "✓", lost: "◐", grasped: "○", failure: "✗", none: "–" };
   const byId = (id) => document.getElementById(id);
   const [list, video, overlay, strip, scrubber] = ["rows", "video", "overlay", "strip", "scrubber"].map(byId);
 

@@ -2,7 +2,7 @@
 "use strict";
 
 const SVG = "http://www.w3.org/2000/svg";
-// The model's coordinates run over 256 x 256; the camera's picture is 4 : 3.
+// The model's coordinates run over 256 x 256; the camera's image is 4 : 3.
 const ACROSS = (256 * 4) / 3;
 const DOWN = 256;
 const FLAGS = ["grasped", "ever grasped", "grasped for some steps", "moved the right object", "moved the wrong object", "on target", "success now", "success at some step", "released success"];

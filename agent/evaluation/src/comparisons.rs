@@ -1,0 +1,97 @@
+//! What is compared: gains between settings on the same episodes, and how much of the gap to the oracle each closes.
+
+use decision::{Setting, Strategy};
+
+use crate::counted::{SettingEpisodes, in_common};
+use crate::estimate::{self, Gain, Headroom};
+
+/// The setting that the program runs unless told otherwise: what a run's headline is about.
+pub const DEFAULT_SETTING: Setting =
+    Setting { strategy: Strategy::Verifier, candidates: 5, temperature: 1.0 };
+
+/// The gain of one setting over another on the episodes that both have run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SettingGain {
+    /// The setting in question.
+    pub better: Setting,
+    /// What it is compared with.
+    pub worse: Setting,
+    /// Difference of last-step success.
+    pub gain: Gain,
+}
+
+/// How much of the gap between a single sample and the oracle a setting closes, at one temperature and with as many
+/// candidates as the oracle has.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SettingHeadroom {
+    /// The setting in question.
+    pub setting: Setting,
+    /// On the episodes that all three have run.
+    pub headroom: Headroom,
+}
+
+/// The verifier against everything that costs less, with agreement against agreement alone; and what a second chance at a
+/// well-formed candidate is worth by itself.
+pub fn gains(settings: &[SettingEpisodes<'_>]) -> Vec<SettingGain> {
+    let mut gains = Vec::new();
+    for better in settings {
+        for worse in settings.iter().filter(|worse| is_compared(better.setting, worse.setting)) {
+            let [ours, theirs] = in_common([better, worse]);
+            if let Some(gain) = estimate::gain(&ours, &theirs) {
+                gains.push(SettingGain { better: better.setting, worse: worse.setting, gain });
+            }
+        }
+    }
+    gains
+}
+
+fn is_compared(better: Setting, worse: Setting) -> bool {
+    let is_verifier = matches!(better.strategy, Strategy::Verifier | Strategy::VerifierMedoid);
+    let is_as_hot = worse.temperature == better.temperature;
+    let is_as_many = is_as_hot && worse.candidates == better.candidates;
+    match worse.strategy {
+        Strategy::Greedy => is_verifier,
+        Strategy::Sample => {
+            is_as_hot && (is_verifier || better.strategy == Strategy::FirstWellFormed)
+        }
+        Strategy::FirstWellFormed | Strategy::Majority | Strategy::Medoid | Strategy::Worst => {
+            is_as_many && is_verifier
+        }
+        Strategy::Verifier => is_as_many && better.strategy == Strategy::VerifierMedoid,
+        Strategy::VerifierMedoid | Strategy::Oracle => false,
+    }
+}
+
+/// Of every setting that chooses, where a single sample and the oracle ran beside it.
+pub fn headroom(settings: &[SettingEpisodes<'_>]) -> Vec<SettingHeadroom> {
+    let find = |strategy: Strategy, candidates: u32, temperature: f32| {
+        let wanted = Setting { strategy, candidates, temperature };
+        settings.iter().find(|one| one.setting == wanted)
+    };
+    let of_setting = |chosen: &SettingEpisodes<'_>| {
+        let setting = chosen.setting;
+        if matches!(setting.strategy, Strategy::Greedy | Strategy::Sample | Strategy::Oracle) {
+            return None;
+        }
+        let sample = find(Strategy::Sample, 1, setting.temperature)?;
+        let oracle = find(Strategy::Oracle, setting.candidates, setting.temperature)?;
+        let [sample, chosen, oracle] = in_common([sample, chosen, oracle]);
+        let headroom = estimate::headroom(&sample, &chosen, &oracle)?;
+        Some(SettingHeadroom { setting, headroom })
+    };
+    settings.iter().filter_map(of_setting).collect()
+}
+
+/// The comparison that a run's headline tells: the verifier with the default number of candidates and temperature, or as
+/// near to them as the run has, over a single sample.
+pub fn main_gain(gains: &[SettingGain]) -> Option<&SettingGain> {
+    let is_main = |gain: &&SettingGain| {
+        gain.better.strategy == DEFAULT_SETTING.strategy && gain.worse.strategy == Strategy::Sample
+    };
+    let distance = |gain: &&SettingGain| {
+        let Setting { candidates, temperature, .. } = gain.better;
+        let colder = (temperature - DEFAULT_SETTING.temperature).abs();
+        (candidates.abs_diff(DEFAULT_SETTING.candidates), (colder * 1e3) as u32)
+    };
+    gains.iter().filter(is_main).min_by_key(distance)
+}

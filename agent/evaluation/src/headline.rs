@@ -1,0 +1,82 @@
+//! The first sentence of tables and page: what a run shows, with its interval and its number of episodes.
+
+use decision::{Setting, Strategy};
+
+use crate::comparisons::SettingGain;
+use crate::estimate::Rate;
+use crate::results::{Results, SettingResult};
+use crate::statistics::Interval;
+
+/// A statement, the figure that it comes down to, and what to make of it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Headline {
+    /// Before the figure.
+    pub statement: String,
+    /// The gain with its sign, where two settings are compared.
+    pub gain: Option<String>,
+    /// After the figure.
+    pub remark: String,
+}
+
+impl Headline {
+    /// The verifier against a single sample; without both, the first setting alone. None without any setting.
+    pub fn new(results: &Results) -> Option<Headline> {
+        match results.main_gain() {
+            Some(main) => Some(compared(main)),
+            None => results.settings.first().map(alone),
+        }
+    }
+
+    /// All of it as one text.
+    pub fn text(&self) -> String {
+        let parts = [Some(self.statement.as_str()), self.gain.as_deref(), Some(&self.remark)];
+        parts.into_iter().flatten().collect::<Vec<_>>().join(" ")
+    }
+}
+
+fn compared(main: &SettingGain) -> Headline {
+    let gain = &main.gain;
+    let verdict = match (gain.interval.low > 0.0, gain.interval.high < 0.0) {
+        (true, _) => "The verifier is better.",
+        (_, true) => "The verifier is worse.",
+        _ => "Not clear yet: the interval includes 0.",
+    };
+    let Setting { candidates, temperature, .. } = main.better;
+    Headline {
+        statement: format!(
+            "The verifier's choice among {candidates} candidates (T={temperature}) succeeds in {:.1} % of episodes, a \
+             single sample in {:.1} %:",
+            100.0 * gain.better_rate,
+            100.0 * gain.worse_rate,
+        ),
+        gain: Some(format!("{:+.1} percentage points", 100.0 * gain.mean)),
+        remark: format!(
+            "(95 % interval {}, {} pairs). {verdict}",
+            signed(gain.interval),
+            gain.pairs
+        ),
+    }
+}
+
+fn alone(first: &SettingResult) -> Headline {
+    let Rate { value, interval, episodes, .. } = first.all.success;
+    let name = match first.setting.strategy {
+        Strategy::Sample => format!("A single sample ({})", first.setting),
+        _ => format!("{}", first.setting),
+    };
+    let statement = match value {
+        Some(value) => format!(
+            "{name} succeeds in {:.1} % of episodes (95 % interval {:.1} to {:.1}, {episodes} episodes).",
+            100.0 * value,
+            100.0 * interval.low,
+            100.0 * interval.high,
+        ),
+        None => format!("{name} has no episode with an outcome on some of the tasks yet."),
+    };
+    Headline { statement, gain: None, remark: String::new() }
+}
+
+/// The ends of an interval of differences.
+fn signed(interval: Interval) -> String {
+    format!("{:+.1} to {:+.1}", 100.0 * interval.low, 100.0 * interval.high)
+}
