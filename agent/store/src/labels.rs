@@ -1,21 +1,24 @@
-//! The label store: one row per finished episode of any run, fed by the outcomes that agents publish.
+//! The label store: one row per recorded episode of any run, from which verifiers are trained.
 //!
-//! A row names the record that it comes of and everything that decides whether it may teach: layout, seed, strategy,
-//! temperature, policy. The same outcome may come any number of times; it is one row.
+//! A row names its record and holds every field that decides whether the episode may be trained on: layout, seed, strategy,
+//! temperature, policy. Rows come from records alone, each in the transaction that puts its record into the run's index;
+//! what others publish is never read here.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use protocol::{EpisodeOutcome, Statistics};
-use rusqlite::{Connection, OptionalExtension, Row, params};
+use rusqlite::{Connection, OpenFlags, OptionalExtension, Row, params};
 
-use crate::record::{EpisodeIdentity, EpisodeRecord};
+use crate::durable::check_writable;
+use crate::record::EpisodeRecord;
 
 /// Version of the table; a store of another version is refused.
-const STORE_VERSION: i64 = 1;
+const STORE_VERSION: i64 = 2;
 /// How long a writer waits for another one.
-const WAIT_SECS: u64 = 30;
+pub(crate) const WAIT: Duration = Duration::from_secs(30);
 
 /// An open label store. Several processes may write one store.
 #[derive(Debug)]
@@ -29,25 +32,17 @@ pub struct LabelStore {
 pub struct Label {
     /// The episode's name within its run.
     pub id: String,
-    /// What became of it.
+    /// What happened in it.
     pub outcome: EpisodeOutcome,
-    /// Where its record lies; none when the outcome came from another machine.
+    /// Where its record is; none when that is on another machine.
     pub record: Option<PathBuf>,
 }
 
 impl Label {
     /// The label of a record at `path`.
     pub fn new(record: &EpisodeRecord, path: &Path) -> Label {
-        Label {
-            id: record.identity.id(),
-            outcome: outcome(record),
-            record: Some(path.to_path_buf()),
-        }
-    }
-
-    /// The label of an outcome whose record is out of reach.
-    pub fn of_outcome(outcome: EpisodeOutcome) -> Label {
-        Label { id: episode_id(&outcome), outcome, record: None }
+        let (id, path) = (record.identity.id(), path.to_path_buf());
+        Label { id, outcome: outcome(record), record: Some(path) }
     }
 }
 
@@ -73,93 +68,168 @@ pub fn outcome(record: &EpisodeRecord) -> EpisodeOutcome {
     }
 }
 
-/// The name, within its run, of the episode that an outcome is about.
-pub fn episode_id(outcome: &EpisodeOutcome) -> String {
-    let identity = EpisodeIdentity {
-        run: outcome.run.clone(),
-        task: outcome.task.clone(),
-        variant: outcome.variant.clone(),
-        layout: outcome.layout,
-        episode: outcome.episode,
-        seed: outcome.seed,
-        // Not part of the name.
-        sampling_seed: 0,
-        strategy: outcome.strategy.clone(),
-        candidates: outcome.candidates,
-        temperature: outcome.temperature,
-    };
-    identity.id()
-}
-
 impl LabelStore {
-    /// Opens the store, making it when there is none.
+    /// Opens the store for writing, making it when there is none. Fails at once where labels could not be written later.
     pub fn open(path: &Path) -> Result<LabelStore> {
         let name = path.display();
-        if let Some(folder) = path.parent() {
-            std::fs::create_dir_all(folder)
-                .with_context(|| format!("cannot make the folder of the label store {name}"))?;
-        }
+        check_writable(path).with_context(|| format!("cannot open the label store {name}"))?;
         let connection = Connection::open(path)
             .with_context(|| format!("cannot open the label store {name}"))?;
-        connection.busy_timeout(Duration::from_secs(WAIT_SECS))?;
-        let version: i64 = connection
-            .query_row("PRAGMA user_version", [], |row| row.get(0))
-            .with_context(|| format!("{name} is not a label store"))?;
-        ensure!(
-            version == STORE_VERSION || version == 0,
-            "label store {name}: expected version {STORE_VERSION}, got {version}"
-        );
+        connection.busy_timeout(WAIT)?;
+        // A store that is made has none yet.
+        ensure_version(&connection, path, &[STORE_VERSION, 0])?;
+        ensure_whole(&connection, path)?;
         connection
             .execute_batch(SCHEMA)
-            .with_context(|| format!("cannot make the label store {name}"))?;
+            .with_context(|| format!("cannot write the label store {name}"))?;
         Ok(LabelStore { connection, path: path.to_path_buf() })
     }
 
-    /// Keeps a label; true when it is new. A label that comes again may add where its record lies, and nothing else.
+    /// Keeps a label; true when its episode had none.
     pub fn insert(&self, label: &Label) -> Result<bool> {
-        let (outcome, statistics) = (&label.outcome, &label.outcome.statistics);
-        let record = label.record.as_ref().map(|path| path.to_string_lossy().into_owned());
-        let added = self.connection.execute(
-            "INSERT INTO labels VALUES (?1,?2,?3,?4,?5,?6,?7,?8,?9,?10,?11,?12,?13,?14,?15,?16,?17,?18,?19,?20,?21,?22,?23,?24,?25)
-             ON CONFLICT (run, id) DO NOTHING",
-            params![
-                outcome.run, label.id, outcome.task, outcome.variant, outcome.layout, outcome.seed as i64,
-                outcome.episode, outcome.strategy, outcome.candidates, outcome.temperature, outcome.policy,
-                outcome.verifier, statistics.is_success, statistics.is_grasped, statistics.ever_grasped,
-                statistics.consecutive_grasp, statistics.moved_correct_object, statistics.moved_wrong_object,
-                statistics.source_on_target, statistics.ever_success, statistics.released_success, outcome.steps,
-                outcome.score_mean, outcome.simulator, record
-            ],
-        );
-        let added = added
-            .with_context(|| format!("cannot write the label store {}", self.path.display()))?
-            == 1;
-        if !added && record.is_some() {
-            self.connection.execute(
-                "UPDATE labels SET record = ?3 WHERE run = ?1 AND id = ?2 AND record IS NULL",
-                params![outcome.run, label.id, record],
-            )?;
-        }
-        Ok(added)
-    }
-
-    /// Whether an episode has its label.
-    pub fn contains(&self, run: &str, id: &str) -> Result<bool> {
-        let mut statement =
-            self.connection.prepare_cached("SELECT 1 FROM labels WHERE run = ?1 AND id = ?2")?;
-        Ok(statement.query_row([run, id], |_| Ok(())).optional()?.is_some())
-    }
-
-    /// All labels, ordered by run and name.
-    pub fn labels(&self) -> Result<Vec<Label>> {
-        let mut statement = self.connection.prepare("SELECT * FROM labels ORDER BY run, id")?;
-        let labels = statement.query_map([], read)?;
-        labels.map(|label| label.context("the label store holds a row of another form")).collect()
+        let write = || -> Result<bool> {
+            let is_new = !contains(&self.connection, &label.outcome.run, &label.id)?;
+            insert(&self.connection, label)?;
+            Ok(is_new)
+        };
+        write().with_context(|| format!("cannot write the label store {}", self.path.display()))
     }
 }
 
+/// All labels of a store that may be read only, ordered by run and name.
+pub fn labels(path: &Path) -> Result<Vec<Label>> {
+    let name = path.display();
+    ensure!(path.is_file(), "label store {name}: expected a file, got none");
+    let connection = Connection::open_with_flags(path, OpenFlags::SQLITE_OPEN_READ_ONLY)
+        .with_context(|| format!("cannot open the label store {name}"))?;
+    connection.busy_timeout(WAIT)?;
+    ensure_version(&connection, path, &[STORE_VERSION])?;
+    ensure_whole(&connection, path)?;
+    let mut statement = connection.prepare("SELECT * FROM labels ORDER BY run, id")?;
+    let labels = statement.query_map([], read)?;
+    labels.map(|label| label.with_context(|| format!("label store {name}: damaged row"))).collect()
+}
+
+fn ensure_version(connection: &Connection, path: &Path, expected: &[i64]) -> Result<()> {
+    let name = path.display();
+    let version: i64 = connection
+        .query_row("PRAGMA user_version", [], |row| row.get(0))
+        .with_context(|| format!("{name} is not a label store"))?;
+    ensure!(
+        expected.contains(&version),
+        "label store {name}: expected version {STORE_VERSION}, got {version}; use another file"
+    );
+    Ok(())
+}
+
+/// Labels can be made again, but only by the runs that they come from.
+fn ensure_whole(connection: &Connection, path: &Path) -> Result<()> {
+    let found: rusqlite::Result<String> =
+        connection.query_row("PRAGMA quick_check(1)", [], |row| row.get(0));
+    let found = found.unwrap_or_else(|error| error.to_string());
+    ensure!(
+        found == "ok",
+        "label store {}: damaged: {found}; move it away and rerun the commands whose labels it held",
+        path.display()
+    );
+    Ok(())
+}
+
+/// Writes a label to the store that is open or attached, in place of what it said before.
+pub(crate) fn insert(connection: &Connection, label: &Label) -> rusqlite::Result<()> {
+    let (outcome, statistics) = (&label.outcome, &label.outcome.statistics);
+    let record = label.record.as_ref().map(|path| path.to_string_lossy().into_owned());
+    connection.prepare_cached(INSERT)?.execute(params![
+        outcome.run,
+        label.id,
+        outcome.task,
+        outcome.variant,
+        outcome.layout,
+        outcome.seed as i64,
+        outcome.episode,
+        outcome.strategy,
+        outcome.candidates,
+        outcome.temperature,
+        outcome.policy,
+        outcome.verifier,
+        statistics.is_success,
+        statistics.is_grasped,
+        statistics.ever_grasped,
+        statistics.consecutive_grasp,
+        statistics.moved_correct_object,
+        statistics.moved_wrong_object,
+        statistics.source_on_target,
+        statistics.ever_success,
+        statistics.released_success,
+        outcome.steps,
+        outcome.score_mean,
+        outcome.simulator,
+        record
+    ])?;
+    Ok(())
+}
+
+/// What a store was made to say of one run.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Corrections {
+    /// Labels that said something else than their records.
+    pub changed: usize,
+    /// Labels without a record.
+    pub removed: usize,
+}
+
+/// Makes the attached store say of `run` what its records say, which are in `folder`.
+pub(crate) fn reconcile(
+    connection: &Connection,
+    run: &str,
+    folder: &Path,
+    expected: &[Label],
+) -> Result<Corrections> {
+    let mut statement = connection.prepare("SELECT id FROM labels WHERE run = ?1")?;
+    let ids = statement.query_map([run], |row| row.get(0))?;
+    let ids = ids.collect::<rusqlite::Result<Vec<String>>>()?;
+    let mut one = connection.prepare("SELECT * FROM labels WHERE run = ?1 AND id = ?2")?;
+    let mut found = BTreeMap::new();
+    for id in ids {
+        // A row that cannot be read is none that could be right.
+        let label = one.query_row([run, &id], read).ok();
+        found.insert(id, label);
+    }
+    let mut corrections = Corrections::default();
+    for label in expected {
+        match found.remove(&label.id) {
+            Some(Some(same)) if same == *label => continue,
+            // The run's folder was moved.
+            Some(Some(other)) if other.outcome == label.outcome => {}
+            Some(_) => corrections.changed += 1,
+            None => {}
+        }
+        insert(connection, label)?;
+    }
+    for (id, label) in found {
+        let record = label.and_then(|label| label.record);
+        // A copy of the run in another folder may have gone on by itself.
+        if record.is_none_or(|record| record.starts_with(folder)) {
+            connection.execute("DELETE FROM labels WHERE run = ?1 AND id = ?2", [run, &id])?;
+            corrections.removed += 1;
+        }
+    }
+    Ok(corrections)
+}
+
+fn contains(connection: &Connection, run: &str, id: &str) -> rusqlite::Result<bool> {
+    let mut statement =
+        connection.prepare_cached("SELECT 1 FROM labels WHERE run = ?1 AND id = ?2")?;
+    Ok(statement.query_row([run, id], |_| Ok(())).optional()?.is_some())
+}
+
+const INSERT: &str = "INSERT OR REPLACE INTO labels VALUES
+    (?1,?2,?3,?4,?5,?6,?7,?8,?9,?10,?11,?12,?13,?14,?15,?16,?17,?18,?19,?20,?21,?22,?23,?24,?25)";
+
+/// A rollback journal, for a write-ahead log works on one host only, and for transactions over two files.
 const SCHEMA: &str = "
-    PRAGMA journal_mode = WAL;
+    PRAGMA journal_mode = DELETE;
+    BEGIN IMMEDIATE;
     CREATE TABLE IF NOT EXISTS labels (
         run TEXT NOT NULL, id TEXT NOT NULL, task TEXT NOT NULL, variant TEXT NOT NULL, layout INTEGER,
         seed INTEGER NOT NULL, episode INTEGER NOT NULL, strategy TEXT NOT NULL, candidates INTEGER NOT NULL,
@@ -169,7 +239,8 @@ const SCHEMA: &str = "
         source_on_target INTEGER NOT NULL, ever_success INTEGER NOT NULL, released_success INTEGER NOT NULL,
         steps INTEGER NOT NULL, score_mean REAL, simulator TEXT NOT NULL, record TEXT,
         PRIMARY KEY (run, id));
-    PRAGMA user_version = 1;";
+    PRAGMA user_version = 2;
+    COMMIT;";
 
 fn read(row: &Row<'_>) -> rusqlite::Result<Label> {
     let outcome = EpisodeOutcome {
@@ -206,55 +277,91 @@ fn read(row: &Row<'_>) -> rusqlite::Result<Label> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::record::tests::made_up;
 
-    fn label(seed: u64) -> Label {
-        Label::of_outcome(EpisodeOutcome {
-            run: "run-1".into(),
-            task: "widowx_stack_cube".into(),
-            variant: "default".into(),
-            layout: None,
-            seed,
-            episode: 3,
-            strategy: "verifier+medoid".into(),
-            candidates: 5,
-            temperature: 0.7,
-            policy: "cafe".into(),
-            verifier: Some("beef".into()),
-            statistics: Statistics { is_success: true, ..Statistics::default() },
-            steps: 60,
-            score_mean: Some(0.25),
-            simulator: "mujoco 3.8.0".into(),
-        })
+    fn label(episode: u32) -> Label {
+        Label::new(&made_up(episode), Path::new("/runs/a/episodes/x.msgpack"))
     }
 
     #[test]
-    fn the_same_outcome_twice_is_one_row_and_is_read_back_whole() {
+    fn a_label_is_read_back_whole_and_its_episode_has_one_row() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("deep/labels.sqlite");
         let store = LabelStore::open(&path).expect("a store");
-        let mut label = label(1_000_000_007);
-        assert_eq!(label.id, "widowx_stack_cube-default-0003-verifier_medoid-n5-t0.7");
-        assert!(store.insert(&label).expect("first"));
-        label.record = Some(PathBuf::from("runs/a/episodes/x.msgpack"));
-        assert!(!store.insert(&label).expect("second"));
-        assert!(store.contains("run-1", &label.id).expect("query"));
-        assert!(!store.contains("run-2", &label.id).expect("query"));
-        drop(store);
-        assert_eq!(LabelStore::open(&path).expect("again").labels().expect("labels"), [label]);
+        let wrong = Label { outcome: EpisodeOutcome { steps: 99, ..label(3).outcome }, ..label(3) };
+        assert!(store.insert(&wrong).expect("first"));
+        assert!(!store.insert(&label(3)).expect("second"));
+        let elsewhere = Label { record: None, ..label(4) };
+        assert!(store.insert(&elsewhere).expect("another"));
+        assert_eq!(labels(&path).expect("labels"), [label(3), elsewhere]);
     }
 
     #[test]
-    fn a_store_of_another_version_and_a_file_of_another_kind_are_refused() {
+    fn a_store_is_made_to_say_what_the_records_of_a_run_say() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("labels.sqlite");
+        let store = LabelStore::open(&path).expect("a store");
+        // Forged, of an episode without a record, of another run, of a copy of the run, and with a moved record.
+        let mut forged = label(0);
+        forged.outcome.statistics.is_success = false;
+        let mut other_run = label(0);
+        other_run.outcome.run = "other".into();
+        let copy = Label { record: Some("/runs/copy/episodes/x.msgpack".into()), ..label(8) };
+        let moved = Label { record: Some("/runs/before/episodes/x.msgpack".into()), ..label(1) };
+        for label in [&forged, &label(7), &other_run, &copy, &moved] {
+            assert!(store.insert(label).expect("a row"));
+        }
+        let run = Path::new("/runs/a");
+        let expected = [label(0), label(1), label(2)];
+        let corrections = reconcile(&store.connection, "made-up", run, &expected).expect("written");
+        assert_eq!(corrections, Corrections { changed: 1, removed: 1 });
+        let [first, second, third] = expected.clone();
+        assert_eq!(labels(&path).expect("labels"), [first, second, third, copy, other_run]);
+        let again = reconcile(&store.connection, "made-up", run, &expected).expect("written");
+        assert_eq!(again, Corrections::default());
+    }
+
+    #[test]
+    fn what_is_no_label_store_is_refused_by_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("labels.sqlite");
+        let check = |path: &Path, expected: &str| {
+            let writing = format!("{:#}", LabelStore::open(path).expect_err(expected));
+            let reading = format!("{:#}", labels(path).expect_err(expected));
+            for error in [writing, reading] {
+                assert!(error.contains(expected), "{error}");
+                assert!(error.contains(&path.display().to_string()), "{error}");
+            }
+        };
         let other = Connection::open(&path).expect("a database");
-        other.execute_batch("PRAGMA user_version = 7").expect("a version");
-        let error = LabelStore::open(&path).expect_err("version 7");
-        assert!(error.to_string().ends_with("expected version 1, got 7"), "{error}");
+        other.execute_batch("PRAGMA user_version = 1").expect("a version");
+        check(&path, "expected version 2, got 1");
         let text = folder.path().join("text");
-        std::fs::write(&text, "no database at all, but long enough to be read as the header of one, so that sqlite reads it all")
+        std::fs::write(&text, "no database at all, but long enough for a header of one".repeat(9))
             .expect("a file");
-        let error = LabelStore::open(&text).expect_err("text");
-        assert!(error.to_string().ends_with("is not a label store"), "{error}");
+        check(&text, "is not a label store");
+        let missing = folder.path().join("none.sqlite");
+        let error = labels(&missing).expect_err("none").to_string();
+        assert!(error.ends_with("none.sqlite: expected a file, got none"), "{error}");
+        assert!(!missing.exists(), "reading makes none");
+    }
+
+    #[test]
+    fn a_damaged_store_is_said_before_anything_is_written() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("labels.sqlite");
+        let store = LabelStore::open(&path).expect("a store");
+        for episode in 0..200 {
+            store.insert(&label(episode)).expect("a row");
+        }
+        drop(store);
+        let mut bytes = std::fs::read(&path).expect("a file");
+        bytes[20_000..40_000].iter_mut().for_each(|byte| *byte = !*byte);
+        std::fs::write(&path, &bytes).expect("damaged");
+        for error in [LabelStore::open(&path).map(drop), labels(&path).map(drop)] {
+            let error = error.expect_err("damaged").to_string();
+            assert!(error.contains("labels.sqlite: damaged"), "{error}");
+        }
+        assert_eq!(std::fs::read(&path).expect("a file"), bytes);
     }
 }

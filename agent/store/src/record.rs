@@ -3,16 +3,17 @@
 //! A record is one MessagePack file (maps with string keys), written at once when the episode ends. There is no record of
 //! an episode that broke: a fault leaves nothing behind that could become a label.
 
-use std::fs::{File, Permissions};
-use std::io::Write;
-use std::os::unix::fs::PermissionsExt;
-use std::path::Path;
+mod file;
 
-use anyhow::{Context, Result, ensure};
-use decision::{Action, ActionChunk, Setting, Strategy, TaskId};
+use anyhow::{Result, ensure};
+use decision::{Action, ActionChunk};
 use half::f16;
 use protocol::Statistics;
 use serde::{Deserialize, Serialize};
+
+pub use crate::durable::write_whole;
+pub use crate::identity::EpisodeIdentity;
+pub use file::{ReadError, RecordFile};
 
 /// Version of the format; a record of another version is refused.
 pub const RECORD_VERSION: u32 = 4;
@@ -39,64 +40,14 @@ pub struct EpisodeRecord {
     pub wall_secs: f32,
 }
 
-/// What tells one episode from every other. Everything that its course depends on is in here or in [`Versions`].
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct EpisodeIdentity {
-    /// The run that it belongs to.
-    pub run: String,
-    /// The task's name.
-    pub task: String,
-    /// The task's variant.
-    pub variant: String,
-    /// One of the 24 layouts, or none for a random one drawn from `seed`.
-    pub layout: Option<u32>,
-    /// Number within task and variant; equal numbers of one run are paired.
-    pub episode: u32,
-    /// The world's seed.
-    pub seed: u64,
-    /// The policy's seed, the same for every strategy.
-    pub sampling_seed: u64,
-    /// How candidates were chosen.
-    pub strategy: String,
-    /// Candidates per step.
-    pub candidates: u32,
-    /// Sampling temperature; 0 is greedy.
-    pub temperature: f32,
-}
-
-impl EpisodeIdentity {
-    /// The episode's name within its run: a file name and a part of a link, so only `a-z A-Z 0-9 . _ -` stand in it.
-    pub fn id(&self) -> String {
-        format!(
-            "{}-{}-{:04}-{}-n{}-t{}",
-            self.task,
-            self.variant,
-            self.episode,
-            self.strategy.replace('+', "_"),
-            self.candidates,
-            self.temperature
-        )
-    }
-
-    /// How it was run.
-    pub fn setting(&self) -> Result<Setting> {
-        let strategy: Strategy = self.strategy.parse()?;
-        Ok(Setting { strategy, candidates: self.candidates, temperature: self.temperature })
-    }
-
-    /// What was to be done.
-    pub fn task_id(&self) -> TaskId {
-        TaskId::new(&self.task, &self.variant)
-    }
-}
-
 /// Versions of everything that an episode depends on.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Versions {
     /// Of the program.
     pub rever: String,
+    /// The commit that the program was built from, as [`Build::commit_text`](crate::provenance::Build::commit_text) writes it.
+    pub commit: String,
     /// Of the protocol.
     pub protocol: u32,
     /// The server's simulator and its version.
@@ -183,37 +134,6 @@ impl EpisodeRecord {
             chosen.fold((0.0_f32, 0_u32), |(sum, count), score| (sum + score, count + 1));
         (count > 0).then(|| sum / count as f32)
     }
-
-    /// Writes the record so that after any interruption the file is whole or absent.
-    pub fn write(&self, path: &Path) -> Result<()> {
-        let bytes = rmp_serde::to_vec_named(self).context("cannot encode the record")?;
-        write_whole(path, &bytes)
-    }
-
-    /// Reads a record; every byte must belong to it.
-    pub fn read(path: &Path) -> Result<EpisodeRecord> {
-        let name = path.display();
-        let bytes =
-            std::fs::read(path).with_context(|| format!("cannot read the record {name}"))?;
-        // The version comes first: a record of another one may lack what this one has.
-        let Versioned { version } = rmp_serde::from_slice(&bytes)
-            .with_context(|| format!("{name} is not an episode record"))?;
-        ensure!(
-            version == RECORD_VERSION,
-            "{name}: expected record version {RECORD_VERSION}, got {version}"
-        );
-        let mut rest = bytes.as_slice();
-        let record: EpisodeRecord = rmp_serde::from_read(&mut rest)
-            .with_context(|| format!("{name} is not an episode record"))?;
-        ensure!(rest.is_empty(), "{name}: expected one record, got {} bytes after it", rest.len());
-        Ok(record)
-    }
-}
-
-/// What records of all versions have.
-#[derive(Deserialize)]
-struct Versioned {
-    version: u32,
 }
 
 /// A hidden state as it stands in a record.
@@ -229,25 +149,6 @@ pub fn hidden_from_bytes(bytes: &[u8]) -> Result<Vec<f32>> {
         bytes.len()
     );
     Ok(bytes.chunks_exact(2).map(|pair| f16::from_le_bytes([pair[0], pair[1]]).to_f32()).collect())
-}
-
-/// Writes a file under a temporary name, makes it durable, then gives it its name.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    let name = path.display();
-    let folder = path.parent().with_context(|| format!("{name} has no folder"))?;
-    // Others may read what is written, as far as the umask lets them: runs lie on shared volumes.
-    let mut file = tempfile::Builder::new()
-        .permissions(Permissions::from_mode(0o666))
-        .tempfile_in(folder)
-        .with_context(|| format!("cannot create {name}"))?;
-    file.write_all(bytes)
-        .and_then(|()| file.as_file().sync_all())
-        .with_context(|| format!("cannot write {name}"))?;
-    file.persist(path).with_context(|| format!("cannot write {name}"))?;
-    // The name itself is durable only when its folder is.
-    File::open(folder)
-        .and_then(|folder| folder.sync_all())
-        .with_context(|| format!("cannot write {name}"))
 }
 
 #[cfg(test)]
@@ -292,6 +193,7 @@ pub(crate) mod tests {
             },
             versions: Versions {
                 rever: "0.0.0".into(),
+                commit: "f00d".into(),
                 protocol: 1,
                 simulator: "made up 1".into(),
                 policy: "cafe".into(),
@@ -321,39 +223,11 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_record_is_read_back_whole() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let (path, record) = (folder.path().join("a.msgpack"), made_up(3));
-        record.write(&path).expect("written");
-        assert_eq!(EpisodeRecord::read(&path).expect("read"), record);
-        assert_eq!(
-            std::fs::read_dir(folder.path()).expect("a folder").count(),
-            1,
-            "no temporary left"
-        );
-        assert_eq!(record.identity.id(), "widowx_stack_cube-default-0003-verifier_medoid-n2-t0.7");
+    fn a_record_knows_its_setting_and_its_mean_score() {
+        let record = made_up(3);
         assert_eq!(record.score_mean(), Some(0.75));
         let setting = record.identity.setting().expect("a setting");
         assert_eq!(setting.to_string(), "verifier+medoid N=2 T=0.7");
-    }
-
-    #[test]
-    fn damaged_and_foreign_records_are_refused() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("a.msgpack");
-        let check = |bytes: &[u8], expected: &str| {
-            std::fs::write(&path, bytes).expect("written");
-            let error = EpisodeRecord::read(&path).expect_err(expected);
-            assert!(format!("{error:#}").contains(expected), "{error:#}");
-        };
-        let bytes = rmp_serde::to_vec_named(&made_up(0)).expect("bytes");
-        check(&bytes[..bytes.len() - 1], "is not an episode record");
-        check(&[&bytes[..], &[0]].concat(), "expected one record, got 1 bytes after it");
-        let later = EpisodeRecord { version: 5, ..made_up(0) };
-        check(&rmp_serde::to_vec_named(&later).expect("bytes"), "expected record version 4, got 5");
-        // A record of the first version, which had no log-probabilities of tokens.
-        let first = serde_json::json!({"version": 1, "steps": [{"log_probability": -3.5}]});
-        check(&rmp_serde::to_vec_named(&first).expect("bytes"), "expected record version 4, got 1");
     }
 
     #[test]

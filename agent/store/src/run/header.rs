@@ -1,15 +1,21 @@
-//! What a run was asked for, and what a second start may add to it.
+//! What a run was asked for, by which builds it was made, and what a second start may add to it.
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::time::SystemTime;
 
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::record::write_whole;
+use super::RunRequest;
+use crate::durable::write_whole;
+use crate::provenance::Build;
 
 const HEADER: &str = "run.json";
+
+/// Version of the file; a header of another version is refused.
+const HEADER_VERSION: u32 = 2;
 
 /// What an episode's course does not depend on: a run may grow by it.
 const GROWING: [&str; 2] = ["settings", "episodes"];
@@ -18,12 +24,48 @@ const GROWING: [&str; 2] = ["settings", "episodes"];
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunHeader {
+    /// The version of this file's form.
+    pub version: u32,
     /// The run's name everywhere: in records, labels and zenoh keys.
     pub run: String,
     /// Everything that decides the results, by name.
     pub options: Value,
     /// Versions at the start, by name.
     pub versions: Value,
+    /// The different command lines and builds that the run was started with, first to last.
+    pub starts: Vec<RunStart>,
+}
+
+/// A start that differs from those before it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunStart {
+    /// When, RFC 3339.
+    pub time: String,
+    /// The command line, word by word.
+    pub command: Vec<String>,
+    /// The program.
+    pub build: Build,
+}
+
+impl RunHeader {
+    /// Says which other builds made a part of the run; none where all had the sources of `build`.
+    pub fn other_builds(&self, build: &Build) -> Option<String> {
+        let mut others: Vec<String> = Vec::new();
+        for start in self.starts.iter().filter(|start| !start.build.has_sources_of(build)) {
+            let other = start.build.to_string();
+            if !others.contains(&other) {
+                others.push(other);
+            }
+        }
+        let run = &self.run;
+        (!others.is_empty()).then(|| {
+            format!(
+                "the run {run} holds episodes of another build: {}; this is {build}",
+                others.join(", ")
+            )
+        })
+    }
 }
 
 /// Reads `run.json`.
@@ -31,27 +73,52 @@ pub fn read_header(folder: &Path) -> Result<RunHeader> {
     let path = folder.join(HEADER);
     let text = std::fs::read_to_string(&path)
         .with_context(|| format!("{} is not a run: cannot read {HEADER}", folder.display()))?;
-    serde_json::from_str(&text).with_context(|| format!("{} is not a run's header", path.display()))
+    let what = || format!("{} is not a run's header", path.display());
+    let header: Value = serde_json::from_str(&text).with_context(what)?;
+    ensure!(
+        header["version"] == json!(HEADER_VERSION),
+        "{}: expected run version {HEADER_VERSION}, got {}; choose another folder (--out)",
+        path.display(),
+        header["version"]
+    );
+    serde_json::from_value(header).with_context(what)
 }
 
 /// Writes the header of a new run, or checks that of the one in `folder` and notes what is added to it.
-pub fn settle(folder: &Path, options: Value, versions: Value) -> Result<RunHeader> {
-    let path = folder.join(HEADER);
-    let header = if path.exists() {
-        let mut header = read_header(folder)?;
+pub fn settle(request: &RunRequest, has_records: bool) -> Result<RunHeader> {
+    let RunRequest { folder, options, versions, command, build, .. } = request;
+    let name = folder.display();
+    let mut header = if folder.join(HEADER).exists() {
+        let header = read_header(folder)?;
         let check = || -> Result<()> {
-            ensure_same("option", &header.options, &options)?;
-            ensure_same("version", &header.versions, &versions)
+            ensure_same("option", &header.options, options)?;
+            ensure_same("version", &header.versions, versions)
         };
-        check().with_context(|| format!("the run {} exists", folder.display()))?;
-        if !grow(&mut header.options, &options) {
-            return Ok(header);
-        }
+        check().with_context(|| format!("the run {name} exists"))?;
         header
     } else {
-        RunHeader { run: unique_name(folder), options, versions }
+        // The records name their run, but only the header says what else may be mixed with them.
+        ensure!(!has_records, "the run {name} has records but no {HEADER}; choose another --out");
+        RunHeader {
+            version: HEADER_VERSION,
+            run: unique_name(folder),
+            options: options.clone(),
+            versions: versions.clone(),
+            starts: Vec::new(),
+        }
     };
-    write_whole(&path, &serde_json::to_vec_pretty(&header)?)?;
+    if let Some(notice) = header.other_builds(build) {
+        tracing::warn!("{notice}");
+    }
+    let is_known = |start: &RunStart| start.command == *command && start.build == *build;
+    let is_new = !header.starts.iter().any(is_known);
+    if is_new {
+        let time = humantime::format_rfc3339_seconds(SystemTime::now()).to_string();
+        header.starts.push(RunStart { time, command: command.clone(), build: build.clone() });
+    }
+    if grow(&mut header.options, options) || is_new {
+        write_whole(&folder.join(HEADER), &serde_json::to_vec_pretty(&header)?)?;
+    }
     Ok(header)
 }
 
@@ -110,13 +177,18 @@ mod tests {
         json!({"seed": seed, "settings": settings, "episodes": episodes})
     }
 
+    fn settled(folder: &Path, options: Value, versions: Value) -> Result<RunHeader> {
+        let folder = folder.to_path_buf();
+        settle(&RunRequest { folder, options, versions, ..RunRequest::default() }, false)
+    }
+
     #[test]
     fn other_options_and_versions_are_refused_by_name() {
         let folder = tempfile::tempdir().expect("a folder");
         let policy = |digest: &str| json!({ "policy": digest });
-        settle(folder.path(), options(1, &["greedy"], 24), policy("cafe")).expect("a new run");
+        settled(folder.path(), options(1, &["greedy"], 24), policy("cafe")).expect("a new run");
         let check = |options: Value, versions: Value, expected: &str| {
-            let error = settle(folder.path(), options, versions).expect_err(expected);
+            let error = settled(folder.path(), options, versions).expect_err(expected);
             assert!(format!("{error:#}").contains(expected), "{error:#}");
         };
         check(
@@ -140,13 +212,69 @@ mod tests {
     fn a_run_grows_by_settings_and_episodes() {
         let folder = tempfile::tempdir().expect("a folder");
         let ask = |settings: &[&str], episodes: u32| {
-            let settled = settle(folder.path(), options(1, settings, episodes), json!({}));
-            let header = settled.expect("a header");
+            let header = settled(folder.path(), options(1, settings, episodes), json!({}));
+            let header = header.expect("a header");
             assert_eq!(header, read_header(folder.path()).expect("written"));
             header.options
         };
         assert_eq!(ask(&["greedy"], 24), options(1, &["greedy"], 24));
         assert_eq!(ask(&["sample", "greedy"], 10), options(1, &["greedy", "sample"], 24));
         assert_eq!(ask(&["sample"], 100), options(1, &["greedy", "sample"], 100));
+    }
+
+    fn build(commit: &str, is_dirty: bool, date: &str) -> Build {
+        let (commit, date) = (commit.to_owned(), date.to_owned());
+        Build { version: "1.2.3".to_owned(), commit, is_dirty, date }
+    }
+
+    #[test]
+    fn every_command_and_build_of_a_run_is_noted_once_and_another_build_is_said() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let start = |build: &Build, episodes: &str| {
+            let command = ["rever", "evaluate", "--episodes", episodes].map(str::to_owned).to_vec();
+            let request = RunRequest {
+                folder: folder.path().to_path_buf(),
+                options: json!({}),
+                versions: json!({}),
+                command,
+                build: build.clone(),
+                ..RunRequest::default()
+            };
+            settle(&request, false).expect("a header")
+        };
+        let (first, rebuilt) = (build("cafe", false, "Monday"), build("cafe", false, "Tuesday"));
+        start(&first, "1");
+        start(&first, "1");
+        assert_eq!(start(&first, "2").starts.len(), 2, "another command");
+        let header = start(&rebuilt, "2");
+        assert_eq!(header.starts.len(), 3);
+        assert_eq!(header.starts[2].build, rebuilt);
+        assert_eq!(header.other_builds(&first), None, "from the same sources");
+        let other = build("beef", true, "Friday");
+        assert_eq!(
+            header.other_builds(&other).expect("said"),
+            format!(
+                "the run {} holds episodes of another build: rever 1.2.3 (commit cafe, built Monday), \
+                 rever 1.2.3 (commit cafe, built Tuesday); this is rever 1.2.3 (commit beef-dirty, built Friday)",
+                header.run
+            )
+        );
+        let header = start(&other, "2");
+        assert_eq!(header.other_builds(&other).map(|said| said.contains("Monday")), Some(true));
+        let edited = build("beef", true, "Saturday");
+        assert!(!edited.has_sources_of(&other), "both from changed sources");
+        assert!(!Build::default().has_sources_of(&first));
+    }
+
+    #[test]
+    fn a_header_of_another_version_and_records_without_one_are_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let request = RunRequest { folder: folder.path().to_path_buf(), ..RunRequest::default() };
+        let error = settle(&request, true).expect_err("no header");
+        assert!(error.to_string().contains("has records but no run.json"), "{error}");
+        let old = json!({"run": "a", "options": {}, "versions": {}});
+        std::fs::write(folder.path().join(HEADER), old.to_string()).expect("written");
+        let error = settle(&request, true).expect_err("old").to_string();
+        assert!(error.contains("run.json: expected run version 2, got null"), "{error}");
     }
 }

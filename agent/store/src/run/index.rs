@@ -1,106 +1,82 @@
-//! The index of a run: a summary of every record, in SQLite, rebuilt wherever it disagrees with the folder.
+//! The index of a run: a summary of every record, in SQLite, so that tables need not read the records.
+//!
+//! Only the holder of the run's lock makes or changes it; whoever else reads it opens it read-only and reads the records
+//! themselves where it does not help.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use rusqlite::{Connection, params};
+use rusqlite::{Connection, OpenFlags, params};
+use sha2::{Digest, Sha256};
 
-use super::{EpisodeSummary, record_path, recorded};
-use crate::record::EpisodeRecord;
+use super::EpisodeSummary;
+use crate::digest::hex;
+use crate::labels::WAIT;
 
 /// The index's file in the run's folder.
-pub const INDEX: &str = "index.sqlite";
-/// Rises when summaries change; an index of another version is rebuilt.
+pub(super) const INDEX: &str = "index.sqlite";
+/// Rises when the table changes; an index of another version is not used.
 const INDEX_VERSION: i64 = 3;
-/// How long a writer waits for another process that reads.
-const WAIT_SECS: u64 = 30;
+/// How long a reader waits for a transaction before it reads the records.
+const READER_WAIT: Duration = Duration::from_secs(2);
 
-/// Opens the index and makes it say what the folder holds.
-pub fn open(folder: &Path) -> Result<Connection> {
+/// Makes an empty index in place of the one that is there; only for the holder of the run's lock.
+pub(super) fn create(folder: &Path) -> Result<Connection> {
     let path = folder.join(INDEX);
-    match open_file(&path).and_then(|index| reconcile(&index, folder).map(|()| index)) {
-        Ok(index) => Ok(index),
-        // The records are the truth, so a damaged index is no loss. A damaged record is, and fails again below.
-        Err(error) => {
-            tracing::warn!("the index {} is rebuilt: {error:#}", path.display());
-            std::fs::remove_file(&path)
-                .with_context(|| format!("cannot remove {}", path.display()))?;
-            let index = open_file(&path)?;
-            reconcile(&index, folder)?;
-            Ok(index)
+    // The journal of a killed process belongs to the index that goes.
+    for name in [INDEX.to_owned(), format!("{INDEX}-journal")] {
+        let old = folder.join(name);
+        if old.exists() {
+            std::fs::remove_file(&old)
+                .with_context(|| format!("cannot remove {}", old.display()))?;
         }
     }
+    let create = || -> rusqlite::Result<Connection> {
+        let index = Connection::open(&path)?;
+        index.busy_timeout(WAIT)?;
+        index.execute_batch(
+            "CREATE TABLE episodes (id TEXT PRIMARY KEY, summary TEXT NOT NULL, sha256 TEXT NOT NULL)",
+        )?;
+        index.pragma_update(None, "user_version", INDEX_VERSION)?;
+        Ok(index)
+    };
+    create().with_context(|| format!("cannot make {}", path.display()))
 }
 
-fn open_file(path: &Path) -> Result<Connection> {
-    let index =
-        Connection::open(path).with_context(|| format!("cannot open {}", path.display()))?;
-    index.busy_timeout(Duration::from_secs(WAIT_SECS))?;
-    let version: i64 = index.query_row("PRAGMA user_version", [], |row| row.get(0))?;
-    ensure!(
-        version == INDEX_VERSION || version == 0,
-        "expected index version {INDEX_VERSION}, got {version}"
-    );
-    index.pragma_update(None, "user_version", INDEX_VERSION)?;
-    index.execute_batch(
-        "PRAGMA synchronous = OFF; -- rebuildable
-         CREATE TABLE IF NOT EXISTS episodes (
-             id TEXT PRIMARY KEY, task TEXT NOT NULL, episode INTEGER NOT NULL, strategy TEXT NOT NULL,
-             candidates INTEGER NOT NULL, temperature REAL NOT NULL, is_success INTEGER NOT NULL, summary TEXT NOT NULL)",
-    )?;
-    Ok(index)
-}
-
-/// Makes the index say what the folder holds.
-fn reconcile(index: &Connection, folder: &Path) -> Result<()> {
-    let in_folder = recorded(folder)?;
-    let mut statement = index.prepare("SELECT id FROM episodes")?;
-    let in_index = statement
-        .query_map([], |row| row.get(0))?
-        .collect::<rusqlite::Result<BTreeSet<String>>>()?;
-    let transaction = index.unchecked_transaction()?;
-    for id in in_index.difference(&in_folder) {
-        transaction.execute("DELETE FROM episodes WHERE id = ?1", [id])?;
-    }
-    for id in in_folder.difference(&in_index) {
-        let path = record_path(folder, id);
-        let record = EpisodeRecord::read(&path)?;
-        let named = record.identity.id();
-        ensure!(named == *id, "{}: expected the episode of that name, got {named}", path.display());
-        insert(&transaction, &record)?;
-    }
-    Ok(transaction.commit()?)
-}
-
-/// Adds a record's summary.
-pub fn insert(index: &Connection, record: &EpisodeRecord) -> Result<()> {
-    let identity = &record.identity;
-    let summary = serde_json::to_string(&EpisodeSummary::from(record))?;
-    index.execute(
-        "INSERT OR REPLACE INTO episodes VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)",
-        params![
-            identity.id(),
-            identity.task,
-            identity.episode,
-            identity.strategy,
-            identity.candidates,
-            identity.temperature,
-            record.statistics.is_success,
-            summary
-        ],
-    )?;
+/// Puts a summary in, in place of the episode's earlier one.
+pub(super) fn insert(index: &Connection, summary: &EpisodeSummary) -> Result<()> {
+    let text = serde_json::to_string(summary)?;
+    let sha256 = hex(&Sha256::digest(&text));
+    let mut statement =
+        index.prepare_cached("INSERT OR REPLACE INTO episodes VALUES (?1, ?2, ?3)")?;
+    statement.execute(params![summary.identity.id(), text, sha256])?;
     Ok(())
 }
 
-/// All summaries, ordered by the episodes' names.
-pub fn summaries(index: &Connection) -> Result<Vec<EpisodeSummary>> {
-    let mut statement = index.prepare("SELECT summary FROM episodes ORDER BY id")?;
-    let texts = statement.query_map([], |row| row.get::<_, String>(0))?;
-    texts
-        .map(|text| {
-            serde_json::from_str(&text?).context("the index holds a summary of another version")
-        })
-        .collect()
+/// All summaries by the episodes' names, from an index that another process may be writing; changes nothing.
+pub(super) fn read(folder: &Path) -> Result<BTreeMap<String, EpisodeSummary>> {
+    let index = Connection::open_with_flags(folder.join(INDEX), OpenFlags::SQLITE_OPEN_READ_ONLY)?;
+    index.busy_timeout(READER_WAIT)?;
+    let version: i64 = index.query_row("PRAGMA user_version", [], |row| row.get(0))?;
+    ensure!(version == INDEX_VERSION, "expected index version {INDEX_VERSION}, got {version}");
+    summaries(&index)
+}
+
+/// All summaries by the episodes' names.
+pub(super) fn summaries(index: &Connection) -> Result<BTreeMap<String, EpisodeSummary>> {
+    let mut statement = index.prepare("SELECT id, summary, sha256 FROM episodes")?;
+    let rows = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?, row.get(2)?)))?;
+    let mut summaries = BTreeMap::new();
+    for row in rows {
+        let (id, text, sha256): (String, String, String) = row?;
+        // SQLite sees damage to its own structure, not to what it holds.
+        ensure!(hex(&Sha256::digest(&text)) == sha256, "the row of {id} is damaged");
+        let summary: EpisodeSummary =
+            serde_json::from_str(&text).with_context(|| format!("the row of {id}"))?;
+        ensure!(summary.identity.id() == id, "the row of {id} is another episode's");
+        summaries.insert(id, summary);
+    }
+    Ok(summaries)
 }

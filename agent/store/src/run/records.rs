@@ -1,0 +1,126 @@
+//! The records in a run's folder: where they are, which there are, and what becomes of damaged ones.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::thread;
+
+use anyhow::{Context, Result, bail};
+
+use super::EpisodeSummary;
+use crate::durable::TEMPORARY_PREFIX;
+use crate::labels::Label;
+use crate::record::{EpisodeRecord, ReadError};
+
+pub(super) const EPISODES: &str = "episodes";
+const RECORD_SUFFIX: &str = ".msgpack";
+/// Follows the name of a record that was set aside.
+const DAMAGED_SUFFIX: &str = ".damaged";
+
+/// What index and label store keep of a record.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Entry {
+    pub summary: EpisodeSummary,
+    pub label: Label,
+}
+
+impl Entry {
+    pub fn new(record: &EpisodeRecord, path: &Path) -> Entry {
+        Entry { summary: EpisodeSummary::from(record), label: Label::new(record, path) }
+    }
+
+    /// Reads a record and checks that it is the episode of its name.
+    pub fn read(folder: &Path, id: &str) -> Result<Entry, ReadError> {
+        let path = record_path(folder, id);
+        let record = EpisodeRecord::read(&path)?;
+        let named = record.identity.id();
+        if named != id {
+            let reason = format!("expected the episode of its name, got {named}");
+            return Err(ReadError::Damaged { path, reason });
+        }
+        Ok(Entry::new(&record, &path))
+    }
+}
+
+/// Where the record of an episode is.
+pub fn record_path(folder: &Path, id: &str) -> PathBuf {
+    folder.join(EPISODES).join(format!("{id}{RECORD_SUFFIX}"))
+}
+
+/// Where the video of an episode is, if there is one.
+pub fn video_path(folder: &Path, id: &str) -> PathBuf {
+    folder.join("videos").join(format!("{id}.mp4"))
+}
+
+/// The names of all recorded episodes: what the folder holds, whatever the index says.
+pub fn recorded(folder: &Path) -> Result<BTreeSet<String>> {
+    let episodes = folder.join(EPISODES);
+    let read = || -> std::io::Result<BTreeSet<String>> {
+        let mut names = BTreeSet::new();
+        for entry in std::fs::read_dir(&episodes)? {
+            let name = entry?.file_name();
+            names.extend(
+                name.to_str().and_then(|name| name.strip_suffix(RECORD_SUFFIX)).map(str::to_owned),
+            );
+        }
+        Ok(names)
+    };
+    read().with_context(|| format!("cannot read {}", episodes.display()))
+}
+
+/// Reads and checks the records of these episodes, in their order, on all processors.
+pub(super) fn read_all(folder: &Path, ids: &[String]) -> Vec<Result<Entry, ReadError>> {
+    let threads = thread::available_parallelism().map_or(1, usize::from);
+    let part = ids.len().div_ceil(threads).max(1);
+    let read = |ids: &[String]| ids.iter().map(|id| Entry::read(folder, id)).collect::<Vec<_>>();
+    thread::scope(|scope| {
+        let parts: Vec<_> = ids.chunks(part).map(|ids| scope.spawn(move || read(ids))).collect();
+        let joined = parts.into_iter().map(|part| part.join());
+        joined
+            .flat_map(|part| part.unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            .collect()
+    })
+}
+
+/// Reads all records of the run `run` for its writer. A damaged one is set aside, so that its episode is run again.
+pub(super) fn check_all(folder: &Path, run: &str) -> Result<Vec<Entry>> {
+    let ids: Vec<String> = recorded(folder)?.into_iter().collect();
+    let mut entries = Vec::with_capacity(ids.len());
+    for (id, read) in ids.iter().zip(read_all(folder, &ids)) {
+        let path = record_path(folder, id);
+        let reason = match read {
+            Ok(entry) if entry.summary.identity.run == run => {
+                entries.push(entry);
+                continue;
+            }
+            Ok(entry) => {
+                format!("expected a record of the run {run}, got {}", entry.summary.identity.run)
+            }
+            Err(ReadError::Damaged { reason, .. }) => reason,
+            Err(error @ ReadError::OtherVersion { .. }) => {
+                bail!("{error}; choose another folder (--out)")
+            }
+            Err(error) => return Err(error.into()),
+        };
+        let aside = folder.join(EPISODES).join(format!("{id}{RECORD_SUFFIX}{DAMAGED_SUFFIX}"));
+        std::fs::rename(&path, &aside)
+            .with_context(|| format!("cannot rename {}", path.display()))?;
+        tracing::warn!(
+            "{id}: its record is set aside as {} and the episode is run again: {reason}",
+            aside.display()
+        );
+    }
+    Ok(entries)
+}
+
+/// Removes what a killed process was writing.
+pub(super) fn remove_unfinished(folder: &Path) -> Result<()> {
+    for entry in std::fs::read_dir(folder.join(EPISODES))? {
+        let entry = entry?;
+        if entry.file_name().to_string_lossy().starts_with(TEMPORARY_PREFIX) {
+            let path = entry.path();
+            std::fs::remove_file(&path)
+                .with_context(|| format!("cannot remove {}", path.display()))?;
+        }
+    }
+    Ok(())
+}

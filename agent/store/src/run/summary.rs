@@ -1,0 +1,58 @@
+//! What tables need of a record.
+
+use protocol::Statistics;
+use serde::{Deserialize, Serialize};
+
+use crate::record::{DecisionRecord, EpisodeIdentity, EpisodeRecord};
+
+/// One recorded episode. An index whose summaries have other fields is not used.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpisodeSummary {
+    /// Which episode.
+    pub identity: EpisodeIdentity,
+    /// As of the last step.
+    pub statistics: Statistics,
+    /// The simulator and its version.
+    pub simulator: String,
+    /// Control steps.
+    pub steps: u32,
+    /// Decisions without a well-formed candidate.
+    pub held_steps: u32,
+    /// Malformed candidates of all decisions.
+    pub malformed: u32,
+    /// Candidates of all decisions.
+    pub candidates: u32,
+    /// Seconds from the reset to the last step.
+    pub wall_secs: f32,
+    /// Of each decision: its share of its batch's time.
+    pub decision_ms: Vec<f32>,
+    /// Of each decision: how many were made together with it, itself included.
+    pub batch_size: Vec<u32>,
+    /// Of each step.
+    pub step_ms: Vec<f32>,
+    /// Of each step.
+    pub simulator_ms: Vec<f32>,
+}
+
+impl From<&EpisodeRecord> for EpisodeSummary {
+    fn from(record: &EpisodeRecord) -> EpisodeSummary {
+        let candidates = || record.decisions().flat_map(|decision| &decision.candidates);
+        EpisodeSummary {
+            identity: record.identity.clone(),
+            statistics: record.statistics,
+            simulator: record.versions.simulator.clone(),
+            steps: record.steps.len() as u32,
+            held_steps: record.decisions().filter(|decision| decision.chosen.is_none()).count()
+                as u32,
+            malformed: candidates().filter(|candidate| candidate.malformed.is_some()).count()
+                as u32,
+            candidates: candidates().count() as u32,
+            wall_secs: record.wall_secs,
+            decision_ms: record.decisions().map(DecisionRecord::milliseconds).collect(),
+            batch_size: record.decisions().map(|decision| decision.batch_size).collect(),
+            step_ms: record.steps.iter().map(|step| step.step_ms).collect(),
+            simulator_ms: record.steps.iter().map(|step| step.simulator_ms).collect(),
+        }
+    }
+}

@@ -1,0 +1,369 @@
+//! What a run keeps, whatever happens to its process and to its files.
+
+use std::os::unix::fs::PermissionsExt;
+
+use serde_json::json;
+
+use super::*;
+use crate::labels::{Label, labels};
+use crate::queue::FaultScope;
+use crate::record::{RecordFile, tests::made_up};
+use crate::run::{faults::FAULTS, index::INDEX, recorded, summaries};
+
+fn request(folder: &Path) -> RunRequest {
+    RunRequest {
+        folder: folder.join("run"),
+        labels: Some(folder.join("labels.sqlite")),
+        options: json!({"seed": 1, "settings": ["greedy"]}),
+        versions: json!({"policy": "cafe"}),
+        command: vec!["rever".into(), "evaluate".into()],
+        build: Build { commit: "f00d".into(), ..Build::default() },
+    }
+}
+
+fn open(folder: &Path) -> Run {
+    Run::open(&request(folder)).expect("a run")
+}
+
+fn episode(run: &Run, episode: u32) -> EpisodeRecord {
+    let mut record = made_up(episode);
+    record.identity.run.clone_from(&run.header.run);
+    record
+}
+
+fn record(run: &Run, number: u32) -> PathBuf {
+    let record = episode(run, number);
+    run.record(&record).expect("recorded");
+    record_path(&run.folder, &record.identity.id())
+}
+
+fn episodes(summaries: &[EpisodeSummary]) -> Vec<u32> {
+    summaries.iter().map(|summary| summary.identity.episode).collect()
+}
+
+fn stored(folder: &Path) -> Vec<Label> {
+    labels(&folder.join("labels.sqlite")).expect("labels")
+}
+
+/// Overwrites a row of any database, as damage or a forger would.
+fn tamper(path: &Path, sql: &str) {
+    let connection = Connection::open(path).expect("a database");
+    assert!(connection.execute(sql, []).expect("tampered") > 0);
+}
+
+#[test]
+fn a_run_is_resumed_with_what_it_has_and_every_record_says_how_it_came_about() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let path = record(&run, 0);
+    let name = run.header.run.clone();
+    run.close().expect("closed");
+    let run = open(folder.path());
+    assert_eq!(run.header.run, name);
+    record(&run, 1);
+    assert_eq!(episodes(&run.summaries().expect("summaries")), [0, 1]);
+    assert_eq!(episodes(&summaries(&run.folder).expect("while it is written")), [0, 1]);
+    assert_eq!(run.recorded().expect("names").len(), 2);
+    let provenance = RecordFile::read(&path).expect("a record").provenance;
+    let RunRequest { command, options, build, .. } = request(folder.path());
+    assert_eq!(provenance, Provenance { command, options, build });
+    assert_eq!(run.header.starts.len(), 1, "twice the same command and build");
+}
+
+#[test]
+fn two_processes_cannot_write_one_run() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let _first = open(folder.path());
+    let error = Run::open(&request(folder.path())).expect_err("locked");
+    assert!(error.to_string().ends_with("is being written by another process"), "{error}");
+}
+
+#[test]
+fn a_closed_run_is_free_while_a_starting_child_still_holds_its_files() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let _held_by_the_child = run._lock.0.try_clone().expect("a copy");
+    drop(run);
+    open(folder.path());
+}
+
+#[test]
+fn a_label_is_there_with_its_record_and_neither_without_the_other() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let path = record(&run, 0);
+    let expected = Label::new(&episode(&run, 0), &path);
+    assert_eq!(stored(folder.path()), [expected]);
+    // While another process holds the label store, neither index nor store gets the episode.
+    let other = Connection::open(folder.path().join("labels.sqlite")).expect("a store");
+    other.execute_batch("BEGIN EXCLUSIVE").expect("locked");
+    run.connection.busy_timeout(std::time::Duration::ZERO).expect("no wait");
+    record(&run, 1);
+    assert_eq!(index::summaries(&run.connection).expect("an index").len(), 1);
+    assert_eq!(episodes(&summaries(&run.folder).expect("from its record")), [0, 1]);
+    other.execute_batch("COMMIT").expect("unlocked");
+    assert_eq!(stored(folder.path()).len(), 1);
+    record(&run, 2);
+    run.close().expect("closed");
+    assert_eq!(stored(folder.path()).len(), 3);
+}
+
+#[test]
+fn labels_that_could_not_be_written_are_said_at_the_end_and_completed_at_the_next_start() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let other = Connection::open(folder.path().join("labels.sqlite")).expect("a store");
+    other.execute_batch("BEGIN EXCLUSIVE").expect("locked");
+    run.connection.busy_timeout(std::time::Duration::ZERO).expect("no wait");
+    record(&run, 0);
+    let error = format!("{:#}", run.close().expect_err("one label is missing"));
+    assert!(error.starts_with("1 recorded episodes of the run run-"), "{error}");
+    assert!(error.contains("rerun the same command: cannot write the index of"), "{error}");
+    assert!(error.contains("labels.sqlite: database is locked"), "{error}");
+    other.execute_batch("COMMIT").expect("unlocked");
+    assert_eq!(stored(folder.path()), []);
+    open(folder.path()).close().expect("closed");
+    assert_eq!(stored(folder.path()).len(), 1);
+}
+
+#[test]
+fn labels_say_what_records_say_whatever_was_written_beside_them() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    for number in 0..3 {
+        record(&run, number);
+    }
+    let expected = stored(folder.path());
+    run.close().expect("closed");
+    let store = folder.path().join("labels.sqlite");
+    tamper(&store, "UPDATE labels SET is_success = NOT is_success, steps = 99 WHERE episode = 1");
+    tamper(&store, "DELETE FROM labels WHERE episode = 2");
+    tamper(
+        &store,
+        "INSERT INTO labels SELECT run, '../../forged', task, variant, layout, seed, 77, strategy, candidates,
+         temperature, policy, verifier, 1, 1, 1, 1, 1, 1, 1, 1, 1, 60, 0.5, 'forged', NULL FROM labels LIMIT 1",
+    );
+    open(folder.path()).close().expect("closed");
+    assert_eq!(stored(folder.path()), expected);
+}
+
+#[test]
+fn a_moved_run_has_labels_that_name_its_records() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    record(&run, 0);
+    let before = run.folder.clone();
+    run.close().expect("closed");
+    let request = RunRequest { folder: folder.path().join("moved"), ..request(folder.path()) };
+    std::fs::rename(before, &request.folder).expect("moved");
+    Run::open(&request).expect("the same run").close().expect("closed");
+    let labels = stored(folder.path());
+    assert_eq!(labels.len(), 1);
+    let path = labels[0].record.as_ref().expect("a record");
+    assert!(path.starts_with(&request.folder) && path.exists(), "{}", path.display());
+}
+
+#[test]
+fn a_reader_leaves_the_index_of_a_running_writer_alone() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    for number in 0..3 {
+        record(&run, number);
+    }
+    let index = run.folder.join(INDEX);
+    let expected = run.summaries().expect("summaries");
+    // An index of a later build, a row that is damaged, and a record that cannot be read.
+    for sql in [
+        "PRAGMA user_version = 99",
+        "UPDATE episodes SET summary = replace(summary, 'true', 'false')",
+    ] {
+        let other = Connection::open(&index).expect("an index");
+        other.execute_batch(sql).expect("tampered");
+        drop(other);
+        let before = std::fs::read(&index).expect("an index");
+        assert_eq!(summaries(&run.folder).expect("from the records"), expected);
+        assert_eq!(std::fs::read(&index).expect("an index"), before);
+    }
+    std::fs::write(record_path(&run.folder, &expected[1].identity.id()), b"half").expect("damaged");
+    assert_eq!(episodes(&summaries(&run.folder).expect("the others")), [0, 2]);
+    // The writer goes on.
+    record(&run, 3);
+    assert_eq!(stored(folder.path()).len(), 4);
+    run.close().expect("nothing is missing");
+}
+
+#[test]
+fn a_reader_needs_no_permission_to_write() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    record(&run, 0);
+    let path = run.folder.clone();
+    run.close().expect("closed");
+    let set = |mode: u32| {
+        let set = |path: &Path, mode| {
+            std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).expect("a mode");
+        };
+        set(&path.join(INDEX), mode & 0o666);
+        set(&path, mode);
+    };
+    set(0o555);
+    let read = summaries(&path);
+    let index = index::read(&path);
+    set(0o755);
+    assert_eq!(episodes(&read.expect("readable")), [0]);
+    assert_eq!(index.expect("a usable index").len(), 1);
+    assert!(!path.join(format!("{INDEX}-journal")).exists());
+}
+
+#[test]
+fn the_index_is_made_anew_whatever_it_was() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    for number in 0..50 {
+        record(&run, number);
+    }
+    let index = run.folder.join(INDEX);
+    let expected = run.summaries().expect("summaries");
+    run.close().expect("closed");
+    let whole = std::fs::read(&index).expect("an index");
+    let damaged: Vec<u8> = (0..whole.len())
+        .map(|place| if (12_000..24_000).contains(&place) { !whole[place] } else { whole[place] })
+        .collect();
+    let check = |bytes: Option<&[u8]>| {
+        match bytes {
+            Some(bytes) => std::fs::write(&index, bytes).expect("written"),
+            None => std::fs::remove_file(&index).expect("removed"),
+        }
+        let path = index.parent().expect("a folder");
+        assert_eq!(summaries(path).expect("a reader"), expected);
+        let run = open(folder.path());
+        assert_eq!(run.summaries().expect("the writer"), expected);
+        assert_eq!(index::summaries(&run.connection).expect("the index").len(), 50);
+        run.close().expect("closed");
+    };
+    check(None);
+    check(Some(&[0x5a; 4096]));
+    check(Some(&whole[..whole.len() / 2]));
+    check(Some(&damaged));
+    std::fs::remove_file(record_path(
+        index.parent().expect("a folder"),
+        &expected[2].identity.id(),
+    ))
+    .expect("a record");
+    let run = open(folder.path());
+    assert_eq!(run.summaries().expect("summaries").len(), 49);
+    run.close().expect("closed");
+    assert_eq!(stored(folder.path()).len(), 49);
+}
+
+#[test]
+fn a_damaged_record_is_set_aside_and_its_episode_is_run_again() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let paths: Vec<PathBuf> = (0..5).map(|number| record(&run, number)).collect();
+    let (path, expected) = (run.folder.clone(), run.summaries().expect("summaries"));
+    run.close().expect("closed");
+    // One bit, an end that is missing, nothing at all, and the record of another episode.
+    let mut bytes = std::fs::read(&paths[0]).expect("a record");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&paths[0], &bytes).expect("damaged");
+    std::fs::write(&paths[1], &bytes[..middle]).expect("damaged");
+    std::fs::write(&paths[2], b"").expect("damaged");
+    std::fs::copy(&paths[4], &paths[3]).expect("damaged");
+    let run = open(folder.path());
+    assert_eq!(episodes(&run.summaries().expect("summaries")), [4]);
+    assert_eq!(run.recorded().expect("names").len(), 1);
+    assert_eq!(stored(folder.path()).len(), 1, "no label of a record that is gone");
+    for aside in &paths[..4] {
+        let aside = PathBuf::from(format!("{}.damaged", aside.display()));
+        assert!(aside.exists(), "{}", aside.display());
+    }
+    for number in 0..4 {
+        record(&run, number);
+    }
+    run.close().expect("closed");
+    assert_eq!(summaries(&path).expect("summaries"), expected);
+    assert_eq!(
+        open(folder.path()).recorded().expect("names").len(),
+        5,
+        "what is aside stays there"
+    );
+}
+
+#[test]
+fn records_of_another_version_are_never_set_aside() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let path = record(&run, 0);
+    run.close().expect("closed");
+    let old = json!({"version": 3, "steps": []});
+    std::fs::write(&path, rmp_serde::to_vec_named(&old).expect("bytes")).expect("written");
+    let error = Run::open(&request(folder.path())).expect_err("another version").to_string();
+    assert!(error.contains("expected record version 4, got 3; choose another folder"), "{error}");
+    assert!(path.exists());
+}
+
+#[test]
+fn a_record_of_another_run_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let error = run.record(&made_up(0)).expect_err("another run").to_string();
+    assert!(error.contains("expected a record of the run run-"), "{error}");
+    assert!(error.ends_with("got made-up"), "{error}");
+    assert!(run.recorded().expect("names").is_empty());
+}
+
+#[test]
+fn a_label_store_that_cannot_be_written_is_said_before_anything_starts() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let check = |labels: &Path, expected: &str| {
+        let request = RunRequest { labels: Some(labels.to_path_buf()), ..request(folder.path()) };
+        let error = format!("{:#}", Run::open(&request).expect_err(expected));
+        assert!(
+            error.contains(expected) && error.contains(&labels.display().to_string()),
+            "{error}"
+        );
+    };
+    check(folder.path(), "it exists and is not a file");
+    check(Path::new("/proc/labels.sqlite"), "cannot open the label store");
+    let text = folder.path().join("text");
+    std::fs::write(&text, "a text ".repeat(100)).expect("a file");
+    check(&text, "is not a label store");
+}
+
+#[test]
+fn what_a_killed_process_left_unfinished_is_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let fault = FaultRecord {
+        identity: made_up(0).identity,
+        attempt: 1,
+        server: "s".into(),
+        scope: FaultScope::Server,
+        reason: "lost".into(),
+        never_acted: false,
+    };
+    run.fault(&fault).expect("noted");
+    let path = run.folder.clone();
+    drop(run);
+    let half = path.join(EPISODES).join(".tmpabc");
+    std::fs::write(&half, b"half").expect("written");
+    let append = |bytes: &[u8]| {
+        let mut text = std::fs::read(path.join(FAULTS)).expect("faults");
+        text.extend(bytes);
+        std::fs::write(path.join(FAULTS), text).expect("written");
+    };
+    append(b"{\"identity\": {");
+    let run = open(folder.path());
+    assert!(!half.exists());
+    assert_eq!(faults::faults(&path).expect("faults"), std::slice::from_ref(&fault));
+    run.fault(&fault).expect("noted");
+    drop(run);
+    // A line that is no text, and one that is no fault, are not counted; those around them are.
+    append(b"\xff\xfe\n{\"attempt\": 1}\n");
+    let run = open(folder.path());
+    run.fault(&fault).expect("noted");
+    assert_eq!(faults::faults(&path).expect("faults"), [fault.clone(), fault.clone(), fault]);
+    assert_eq!(recorded(&path).expect("names").len(), 0);
+}
