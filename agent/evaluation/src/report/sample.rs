@@ -13,7 +13,7 @@ use store::record::{
     CandidateRecord, DecisionRecord, EpisodeIdentity, EpisodeRecord, RECORD_VERSION, StepRecord,
     Versions,
 };
-use store::run::{EpisodeSummary, Run};
+use store::run::{EpisodeSummary, Run, RunRequest};
 use store::video::Video;
 
 pub const TASKS: [&str; 2] = ["widowx_spoon_on_towel", "widowx_stack_cube"];
@@ -65,16 +65,18 @@ pub fn summaries() -> Vec<EpisodeSummary> {
 /// Writes the run into a folder, with a video of every verifier episode on the first task.
 pub fn write(folder: &Path) -> anyhow::Result<()> {
     let options = json!({ "strategies": ["greedy", "sample", "verifier"], "temperatures": [1.0] });
-    let run = Run::open(folder, options, json!({ "rever": "0.0.0", "simulator": "made up" }))?;
-    let records = records();
-    std::fs::create_dir_all(folder.join("videos"))?;
-    for record in &records {
+    let versions = json!({ "rever": "0.0.0", "simulator": "made up" });
+    let folder = folder.to_path_buf();
+    let run = Run::open(&RunRequest { folder, options, versions, ..RunRequest::default() })?;
+    let mut records = records();
+    for record in &mut records {
+        record.identity.run.clone_from(&run.header.run);
         if has_video(record) {
-            std::fs::write(run.video_path(&record.identity.id()), video(record)?)?;
+            run.write_video(&record.identity.id(), &video(record)?)?;
         }
         run.record(record)?;
     }
-    Ok(())
+    run.close()
 }
 
 /// Videos are slow to make, so only some episodes have one.
@@ -130,6 +132,7 @@ fn record(identity: EpisodeIdentity, is_success: bool, random: &mut ChaCha8Rng) 
         steps_max: 60,
         versions: Versions {
             rever: "0.0.0".into(),
+            commit: "0".repeat(40),
             protocol: 1,
             simulator: "made up".into(),
             policy: "0".repeat(64),

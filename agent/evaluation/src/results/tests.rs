@@ -2,6 +2,7 @@
 
 use decision::Strategy;
 use serde_json::json;
+use store::queue::FaultScope;
 use store::record::EpisodeIdentity;
 
 use super::*;
@@ -80,6 +81,7 @@ fn fault(strategy: Strategy, episode: u32, attempt: u32, never_acted: bool) -> F
         identity: identity(&TaskId::default_of(TASKS[0]), episode, setting(strategy)),
         attempt,
         server: "s".into(),
+        scope: FaultScope::Server,
         reason: "lost".into(),
         never_acted,
     }
