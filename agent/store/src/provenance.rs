@@ -17,6 +17,9 @@ pub struct Provenance {
     pub build: Build,
 }
 
+/// Follows a commit from which files differed.
+const DIRTY: &str = "-dirty";
+
 /// A build of the program; all fields are empty where the caller does not know its own.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -32,10 +35,24 @@ pub struct Build {
 }
 
 impl Build {
+    /// Of a version, a commit as `git describe --always --dirty` writes it, and a date.
+    pub fn new(version: &str, described: &str, date: &str) -> Build {
+        let (commit, is_dirty) = match described.strip_suffix(DIRTY) {
+            Some(commit) => (commit, true),
+            None => (described, false),
+        };
+        Build {
+            version: version.to_owned(),
+            commit: commit.to_owned(),
+            is_dirty,
+            date: date.to_owned(),
+        }
+    }
+
     /// The commit, with `-dirty` when something differed from it.
     pub fn commit_text(&self) -> String {
         let commit = if self.commit.is_empty() { "unknown" } else { &self.commit };
-        format!("{commit}{}", if self.is_dirty { "-dirty" } else { "" })
+        format!("{commit}{}", if self.is_dirty { DIRTY } else { "" })
     }
 
     /// Whether both are known to be built from the same sources. Two builds from a changed commit may differ in anything, so

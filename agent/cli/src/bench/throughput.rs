@@ -17,7 +17,7 @@ use serde::Serialize;
 use serde_json::json;
 use store::plan::SeedRange;
 use store::queue::{EpisodeQueue, RunQueue};
-use store::run::Run;
+use store::run::{Run, RunRequest};
 use tokio::sync::watch;
 use verifier::Verifier;
 use vla::Vla;
@@ -91,7 +91,12 @@ impl ThroughputBench<'_> {
     ) -> Result<Row> {
         let folder = tempfile::tempdir().context("cannot make a folder")?;
         let title = format!("{sessions} sessions");
-        let run = Run::open(folder.path(), json!({ "bench": "throughput" }), json!({}))?;
+        let run = Run::open(&RunRequest {
+            folder: folder.path().to_path_buf(),
+            options: json!({ "bench": "throughput" }),
+            build: build_info::build(),
+            ..RunRequest::default()
+        })?;
         let name = run.header.run.clone();
         let warm_up = WARM_UP_STEPS * sessions as u64;
         let queue = self.queue(&name, tasks, warm_up + self.decisions, sessions);

@@ -15,9 +15,10 @@ use runtime::site::{Deployment, Site};
 use runtime::setup;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
+use store::labels::LabelStore;
 use store::plan::SeedRange;
 use store::record::Versions;
-use store::run::{self, Run};
+use store::run::{self, Run, RunRequest};
 use tokio::runtime::Runtime;
 use verifier::Verifier;
 use vla::{DeviceName, Vla};
@@ -204,7 +205,8 @@ impl EpisodesArguments {
         for name in [Some(&self.fleet), self.follow_verifier.as_ref()].into_iter().flatten() {
             protocol::Keys::new(name).map_err(|error| WrongUsage(error.to_string()))?;
         }
-        store::check_writable(&self.labels)
+        // Made, if there is none, before anything is run for it.
+        LabelStore::open(&self.labels).map(drop)
     }
 
     /// The tasks that were asked for; where none were, those that the servers offer, which must run for that.
@@ -242,7 +244,14 @@ impl EpisodesArguments {
             let short: String = digest.iter().take(4).map(|byte| format!("{byte:02x}")).collect();
             Path::new("runs").join(format!("{title}-{short}"))
         });
-        Run::open(&folder, options, versions)
+        Run::open(&RunRequest {
+            folder,
+            labels: Some(self.labels.clone()),
+            options,
+            versions,
+            command: build_info::command_line(),
+            build: build_info::build(),
+        })
     }
 
     /// Where the servers are.

@@ -76,7 +76,7 @@ pub fn write(folder: &Path) -> anyhow::Result<()> {
         }
         run.record(record)?;
     }
-    run.close()
+    run.complete()
 }
 
 /// Videos are slow to make, so only some episodes have one.

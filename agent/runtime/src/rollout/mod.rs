@@ -187,6 +187,7 @@ impl<P: SessionPool> Shared<P> {
             identity: lease.job.identity.clone(),
             attempt: lease.job.attempt,
             server: info.server.clone(),
+            scope: fault.scope(),
             never_acted: matches!(fault, AttemptFault::NeverActed { .. }),
             reason: fault.to_string(),
         };

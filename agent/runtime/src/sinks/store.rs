@@ -25,4 +25,8 @@ impl EventSink for StoreSink {
             Event::Started { .. } | Event::Stepped { .. } | Event::Notice(_) => Ok(()),
         }
     }
+
+    fn finish(&mut self) -> Result<()> {
+        self.run.complete()
+    }
 }

@@ -222,11 +222,6 @@ mod tests {
         assert_eq!(ask(&["sample"], 100), options(1, &["greedy", "sample"], 100));
     }
 
-    fn build(commit: &str, is_dirty: bool, date: &str) -> Build {
-        let (commit, date) = (commit.to_owned(), date.to_owned());
-        Build { version: "1.2.3".to_owned(), commit, is_dirty, date }
-    }
-
     #[test]
     fn every_command_and_build_of_a_run_is_noted_once_and_another_build_is_said() {
         let folder = tempfile::tempdir().expect("a folder");
@@ -242,7 +237,8 @@ mod tests {
             };
             settle(&request, false).expect("a header")
         };
-        let (first, rebuilt) = (build("cafe", false, "Monday"), build("cafe", false, "Tuesday"));
+        let build = |described, date| Build::new("1.2.3", described, date);
+        let (first, rebuilt) = (build("cafe", "Monday"), build("cafe", "Tuesday"));
         start(&first, "1");
         start(&first, "1");
         assert_eq!(start(&first, "2").starts.len(), 2, "another command");
@@ -250,7 +246,7 @@ mod tests {
         assert_eq!(header.starts.len(), 3);
         assert_eq!(header.starts[2].build, rebuilt);
         assert_eq!(header.other_builds(&first), None, "from the same sources");
-        let other = build("beef", true, "Friday");
+        let other = build("beef-dirty", "Friday");
         assert_eq!(
             header.other_builds(&other).expect("said"),
             format!(
@@ -261,7 +257,7 @@ mod tests {
         );
         let header = start(&other, "2");
         assert_eq!(header.other_builds(&other).map(|said| said.contains("Monday")), Some(true));
-        let edited = build("beef", true, "Saturday");
+        let edited = build("beef-dirty", "Saturday");
         assert!(!edited.has_sources_of(&other), "both from changed sources");
         assert!(!Build::default().has_sources_of(&first));
     }

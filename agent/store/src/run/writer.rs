@@ -86,7 +86,7 @@ impl Run {
     }
 
     /// Makes an episode durable: its record first, then its summary and its label in one transaction. Where only the second
-    /// fails, nothing is lost; it is said and tried again in [`Run::close`] and at the next start.
+    /// fails, nothing is lost; it is said and tried again in [`Run::complete`] and at the next start.
     pub fn record(&self, record: &EpisodeRecord) -> Result<()> {
         let (id, run) = (record.identity.id(), &self.header.run);
         ensure!(
@@ -135,20 +135,24 @@ impl Run {
         video_path(&self.folder, id)
     }
 
-    /// Ends writing. Fails when labels of recorded episodes cannot be written, which the next start of the run mends.
-    pub fn close(self) -> Result<()> {
-        let incomplete = self.incomplete.take();
-        let (ids, count) = (Vec::from_iter(incomplete), self.header.run.as_str());
+    /// Writes the labels that could not be written before. What is missing when this fails is completed at the next start.
+    pub fn complete(&self) -> Result<()> {
+        let ids = Vec::from_iter(self.incomplete.borrow().iter().cloned());
+        if ids.is_empty() {
+            return Ok(());
+        }
         let complete = || -> Result<()> {
             let entries = records::read_all(&self.folder, &ids).into_iter();
             self.index(&entries.collect::<Result<Vec<Entry>, _>>()?)
         };
-        match ids.len() {
-            0 => Ok(()),
-            missing => complete().with_context(|| {
-                format!("{missing} recorded episodes of the run {count} have no label; rerun the same command")
-            }),
-        }
+        complete().with_context(|| {
+            let (count, run) = (ids.len(), &self.header.run);
+            format!(
+                "{count} recorded episodes of the run {run} have no label; rerun the same command"
+            )
+        })?;
+        self.incomplete.borrow_mut().clear();
+        Ok(())
     }
 
     fn attach_labels(&self) -> Result<()> {

@@ -57,7 +57,7 @@ fn a_run_is_resumed_with_what_it_has_and_every_record_says_how_it_came_about() {
     let run = open(folder.path());
     let path = record(&run, 0);
     let name = run.header.run.clone();
-    run.close().expect("closed");
+    drop(run);
     let run = open(folder.path());
     assert_eq!(run.header.run, name);
     record(&run, 1);
@@ -104,8 +104,9 @@ fn a_label_is_there_with_its_record_and_neither_without_the_other() {
     other.execute_batch("COMMIT").expect("unlocked");
     assert_eq!(stored(folder.path()).len(), 1);
     record(&run, 2);
-    run.close().expect("closed");
+    run.complete().expect("completed");
     assert_eq!(stored(folder.path()).len(), 3);
+    assert_eq!(index::summaries(&run.connection).expect("an index").len(), 3);
 }
 
 #[test]
@@ -116,13 +117,14 @@ fn labels_that_could_not_be_written_are_said_at_the_end_and_completed_at_the_nex
     other.execute_batch("BEGIN EXCLUSIVE").expect("locked");
     run.connection.busy_timeout(std::time::Duration::ZERO).expect("no wait");
     record(&run, 0);
-    let error = format!("{:#}", run.close().expect_err("one label is missing"));
+    let error = format!("{:#}", run.complete().expect_err("one label is missing"));
     assert!(error.starts_with("1 recorded episodes of the run run-"), "{error}");
     assert!(error.contains("rerun the same command: cannot write the index of"), "{error}");
     assert!(error.contains("labels.sqlite: database is locked"), "{error}");
     other.execute_batch("COMMIT").expect("unlocked");
     assert_eq!(stored(folder.path()), []);
-    open(folder.path()).close().expect("closed");
+    drop(run);
+    drop(open(folder.path()));
     assert_eq!(stored(folder.path()).len(), 1);
 }
 
@@ -134,7 +136,7 @@ fn labels_say_what_records_say_whatever_was_written_beside_them() {
         record(&run, number);
     }
     let expected = stored(folder.path());
-    run.close().expect("closed");
+    drop(run);
     let store = folder.path().join("labels.sqlite");
     tamper(&store, "UPDATE labels SET is_success = NOT is_success, steps = 99 WHERE episode = 1");
     tamper(&store, "DELETE FROM labels WHERE episode = 2");
@@ -143,7 +145,7 @@ fn labels_say_what_records_say_whatever_was_written_beside_them() {
         "INSERT INTO labels SELECT run, '../../forged', task, variant, layout, seed, 77, strategy, candidates,
          temperature, policy, verifier, 1, 1, 1, 1, 1, 1, 1, 1, 1, 60, 0.5, 'forged', NULL FROM labels LIMIT 1",
     );
-    open(folder.path()).close().expect("closed");
+    drop(open(folder.path()));
     assert_eq!(stored(folder.path()), expected);
 }
 
@@ -153,10 +155,10 @@ fn a_moved_run_has_labels_that_name_its_records() {
     let run = open(folder.path());
     record(&run, 0);
     let before = run.folder.clone();
-    run.close().expect("closed");
+    drop(run);
     let request = RunRequest { folder: folder.path().join("moved"), ..request(folder.path()) };
     std::fs::rename(before, &request.folder).expect("moved");
-    Run::open(&request).expect("the same run").close().expect("closed");
+    drop(Run::open(&request).expect("the same run"));
     let labels = stored(folder.path());
     assert_eq!(labels.len(), 1);
     let path = labels[0].record.as_ref().expect("a record");
@@ -189,7 +191,7 @@ fn a_reader_leaves_the_index_of_a_running_writer_alone() {
     // The writer goes on.
     record(&run, 3);
     assert_eq!(stored(folder.path()).len(), 4);
-    run.close().expect("nothing is missing");
+    run.complete().expect("nothing is missing");
 }
 
 #[test]
@@ -198,7 +200,7 @@ fn a_reader_needs_no_permission_to_write() {
     let run = open(folder.path());
     record(&run, 0);
     let path = run.folder.clone();
-    run.close().expect("closed");
+    drop(run);
     let set = |mode: u32| {
         let set = |path: &Path, mode| {
             std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).expect("a mode");
@@ -224,7 +226,7 @@ fn the_index_is_made_anew_whatever_it_was() {
     }
     let index = run.folder.join(INDEX);
     let expected = run.summaries().expect("summaries");
-    run.close().expect("closed");
+    drop(run);
     let whole = std::fs::read(&index).expect("an index");
     let damaged: Vec<u8> = (0..whole.len())
         .map(|place| if (12_000..24_000).contains(&place) { !whole[place] } else { whole[place] })
@@ -239,7 +241,7 @@ fn the_index_is_made_anew_whatever_it_was() {
         let run = open(folder.path());
         assert_eq!(run.summaries().expect("the writer"), expected);
         assert_eq!(index::summaries(&run.connection).expect("the index").len(), 50);
-        run.close().expect("closed");
+        drop(run);
     };
     check(None);
     check(Some(&[0x5a; 4096]));
@@ -252,7 +254,7 @@ fn the_index_is_made_anew_whatever_it_was() {
     .expect("a record");
     let run = open(folder.path());
     assert_eq!(run.summaries().expect("summaries").len(), 49);
-    run.close().expect("closed");
+    drop(run);
     assert_eq!(stored(folder.path()).len(), 49);
 }
 
@@ -262,7 +264,7 @@ fn a_damaged_record_is_set_aside_and_its_episode_is_run_again() {
     let run = open(folder.path());
     let paths: Vec<PathBuf> = (0..5).map(|number| record(&run, number)).collect();
     let (path, expected) = (run.folder.clone(), run.summaries().expect("summaries"));
-    run.close().expect("closed");
+    drop(run);
     // One bit, an end that is missing, nothing at all, and the record of another episode.
     let mut bytes = std::fs::read(&paths[0]).expect("a record");
     let middle = bytes.len() / 2;
@@ -282,7 +284,7 @@ fn a_damaged_record_is_set_aside_and_its_episode_is_run_again() {
     for number in 0..4 {
         record(&run, number);
     }
-    run.close().expect("closed");
+    drop(run);
     assert_eq!(summaries(&path).expect("summaries"), expected);
     assert_eq!(
         open(folder.path()).recorded().expect("names").len(),
@@ -296,7 +298,7 @@ fn records_of_another_version_are_never_set_aside() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     let path = record(&run, 0);
-    run.close().expect("closed");
+    drop(run);
     let old = json!({"version": 3, "steps": []});
     std::fs::write(&path, rmp_serde::to_vec_named(&old).expect("bytes")).expect("written");
     let error = Run::open(&request(folder.path())).expect_err("another version").to_string();
