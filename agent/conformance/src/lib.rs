@@ -89,10 +89,13 @@ pub async fn test(
 ) -> Result<Vec<Row>> {
     let found = network.servers(1, SERVER_WAIT).await;
     let wanted = |seen: &str| server.is_none_or(|server| server == seen);
-    let description = found.into_iter().find(|description| wanted(&description.server));
-    let description = description.context(
-        "no server was to be seen that describes itself: check --connect, --fleet and its description",
-    )?;
+    let mut descriptions = found.servers.into_values();
+    let description = descriptions.find(|description| wanted(&description.server));
+    let description = description.with_context(|| {
+        let reasons = found.undescribed.iter().map(|(id, reason)| format!("; server {id} {reason}"));
+        let reasons: String = reasons.collect();
+        format!("no environment server found: check --connect and --fleet{reasons}")
+    })?;
     let subject = Subject::new(network, description)?;
     let mut table = Table { subject: &subject, rows: Vec::new(), report };
     handshake::test(&subject, &mut table).await;

@@ -17,6 +17,9 @@ pub mod fault;
 pub mod session;
 pub mod wire;
 
+#[cfg(test)]
+mod scripted;
+
 // What is told of a run.
 pub mod sinks;
 
@@ -25,3 +28,19 @@ pub mod servers;
 pub mod setup;
 pub mod simulator;
 pub mod site;
+
+#[cfg(test)]
+mod tests {
+    use store::record::Versions;
+
+    /// What records of tests say they were made with.
+    pub fn versions() -> Versions {
+        Versions {
+            rever: "0.0.0".to_owned(),
+            protocol: protocol::PROTOCOL_VERSION,
+            simulator: String::new(),
+            policy: String::new(),
+            verifier: None,
+        }
+    }
+}

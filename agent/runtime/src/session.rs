@@ -91,6 +91,4 @@ pub trait SessionPool: Send + Sync + 'static {
     /// Takes note that a session is gone, and that its server may be.
     fn lost(&self, info: &SessionInfo, fault: &EnvironmentFault);
 
-    /// Takes note that a session is gone through no fault of its server.
-    fn abandoned(&self, info: &SessionInfo);
 }

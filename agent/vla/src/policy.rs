@@ -19,7 +19,7 @@ use crate::network::trace::Trace;
 
 /// A loaded checkpoint.
 pub struct Vla {
-    parser: CompletionParser,
+    pub(crate) parser: CompletionParser,
     pub(crate) network: Network,
     pools: WorkerPools,
     info: PolicyInfo,

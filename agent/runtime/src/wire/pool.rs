@@ -313,11 +313,6 @@ impl SessionPool for ZenohPool {
         drop(state);
         self.freed.notify_waiters();
     }
-
-    fn abandoned(&self, info: &SessionInfo) {
-        self.state().add(&info.server, -1);
-        self.freed.notify_waiters();
-    }
 }
 
 impl State {

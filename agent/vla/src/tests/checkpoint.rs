@@ -12,7 +12,7 @@ fn load_changed(
     name: &str,
     weights: impl FnOnce(&mut HashMap<String, Tensor>) -> Result<()>,
     config: impl FnOnce(&mut serde_json::Value),
-) -> Result<Policy> {
+) -> Result<Vla> {
     let (source, directory) = (fixtures().join(name), tempfile::tempdir()?);
     let mut tensors =
         candle_core::safetensors::load(source.join("model.safetensors"), &Device::Cpu)?;
@@ -26,7 +26,7 @@ fn load_changed(
     Vla::load(directory.path(), DeviceName::Cpu)
 }
 
-fn refusal(policy: Result<Policy>) -> String {
+fn refusal(policy: Result<Vla>) -> String {
     match policy {
         // The outermost context names a temporary folder.
         Err(error) => error.chain().skip(1).map(ToString::to_string).collect::<Vec<_>>().join(": "),
@@ -51,7 +51,7 @@ fn sixteen_bit_weights_load() -> Result<()> {
         Ok(())
     };
     let policy = load_changed("tiny", halve, |_| {})?;
-    assert_ne!(policy.digest(), tiny("tiny", Backend::Kernels)?.digest());
+    assert_ne!(policy.parser().digest(), tiny("tiny", Backend::Kernels)?.parser().digest());
     Ok(())
 }
 

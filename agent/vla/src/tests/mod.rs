@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result};
 use candle_core::{DType, Device, Tensor};
 
-use decision::Image;
+use decision::{Image, Policy as _};
 
 use super::{Backend, DeviceName, Vla};
 

@@ -56,7 +56,7 @@ fn steps_onto_a_shared_prefix_equal_the_whole_sequence() -> Result<()> {
             let policy = tiny(name, backend)?;
             let golden = Golden::load(&fixtures().join(name).join("activations.safetensors"))?;
             let image = golden.image("image")?;
-            let prompts = [golden.ids("prompt")?, policy.prompter.ids("stay")?];
+            let prompts = [golden.ids("prompt")?, policy.parser.prompter.ids("stay")?];
             let forced = golden.ids("forced")?;
             // Two rows continue the first session, one the second; the middle row ends early.
             let rows = [(0, forced.clone()), (0, forced[5..].to_vec()), (1, forced[2..].to_vec())];
@@ -98,6 +98,7 @@ fn the_shipped_model_equals_pytorch_on_recorded_observations() -> Result<()> {
         let instruction = policy.parser().text(&prompt[2..3]);
         let request = decision::ProposalRequest {
             image: &image,
+            state: &[],
             instruction: &instruction,
             candidates: 1,
             temperature: 0.0,

@@ -6,6 +6,9 @@ use candle_core::D;
 use decision::{Candidate, Proposal, ProposalRequest, TAGS};
 use super::*;
 
+/// Parts of the confidence: the tags and seven numbers of an action.
+const PARTS: usize = TAGS.len() + 7;
+
 const INSTRUCTION: &str = "Put the spoon on the towel";
 
 fn image(seed: u8, side: usize) -> Image {
@@ -14,20 +17,21 @@ fn image(seed: u8, side: usize) -> Image {
 }
 
 fn request(image: &Image, candidates: usize, temperature: f32, seed: u64) -> ProposalRequest<'_> {
-    ProposalRequest { image, instruction: INSTRUCTION, candidates, temperature, seed }
+    ProposalRequest { image, state: &[], instruction: INSTRUCTION, candidates, temperature, seed }
 }
 
 #[test]
 fn a_request_does_not_depend_on_the_requests_beside_it() -> Result<()> {
     for name in TINY {
         let policy = tiny(name, Backend::Kernels)?;
-        let side = policy.image_size().0;
+        let side = policy.info().image_size.0;
         let images: Vec<Image> = (0..16).map(|index| image(index, side)).collect();
         let instructions = ["Put the spoon on the towel", "stay", "a much longer instruction"];
         let requests: Vec<ProposalRequest<'_>> = images
             .iter()
             .enumerate()
             .map(|(index, image)| ProposalRequest {
+                state: &[],
                 instruction: instructions[index % 3],
                 ..request(image, 1 + index % 5, [1.0, 0.0, 0.7][index % 3], index as u64)
             })
@@ -49,7 +53,7 @@ fn a_request_does_not_depend_on_the_requests_beside_it() -> Result<()> {
 #[test]
 fn threads_do_not_change_a_bit() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
-    let image = image(3, policy.image_size().0);
+    let image = image(3, policy.info().image_size.0);
     let requests = [request(&image, 8, 1.0, 5), request(&image, 3, 1.0, 6)];
     let propose = |threads: usize| -> Result<Vec<Proposal>> {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
@@ -62,7 +66,7 @@ fn threads_do_not_change_a_bit() -> Result<()> {
 #[test]
 fn seeds_decide_and_candidates_have_streams_of_their_own() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
-    let image = image(1, policy.image_size().0);
+    let image = image(1, policy.info().image_size.0);
     let propose = |candidates, seed| -> Result<Vec<Candidate>> {
         Ok(policy.propose_now(&[request(&image, candidates, 1.0, seed)])?.remove(0).candidates)
     };
@@ -79,7 +83,7 @@ fn seeds_decide_and_candidates_have_streams_of_their_own() -> Result<()> {
 #[test]
 fn temperature_zero_ignores_seeds() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
-    let image = image(1, policy.image_size().0);
+    let image = image(1, policy.info().image_size.0);
     let a = policy.propose_now(&[request(&image, 2, 0.0, 1)])?.remove(0).candidates;
     let b = policy.propose_now(&[request(&image, 1, 0.0, 2)])?.remove(0).candidates;
     assert_eq!(a[0], a[1]);
@@ -92,7 +96,7 @@ fn both_backends_sample_the_same_tokens() -> Result<()> {
     for name in TINY {
         let propose = |backend| -> Result<Vec<Vec<u32>>> {
             let policy = tiny(name, backend)?;
-            let image = image(2, policy.image_size().0);
+            let image = image(2, policy.info().image_size.0);
             let proposal = policy.propose_now(&[request(&image, 6, 1.0, 4)])?.remove(0);
             Ok(proposal.candidates.into_iter().map(|candidate| candidate.tokens).collect())
         };
@@ -104,11 +108,11 @@ fn both_backends_sample_the_same_tokens() -> Result<()> {
 #[test]
 fn first_tokens_are_distributed_as_the_softmax_says() -> Result<()> {
     let mut policy = tiny("tiny", Backend::Kernels)?;
-    policy.config.completion_tokens_max = 1;
-    let image = image(4, policy.image_size().0);
-    let outputs = policy.activations(&image, &policy.prompter.ids(INSTRUCTION)?)?;
+    policy.parser.config.completion_tokens_max = 1;
+    let image = image(4, policy.info().image_size.0);
+    let outputs = policy.activations(&image, &policy.parser.prompter.ids(INSTRUCTION)?)?;
     let logits = &outputs[outputs.len() - 1].1;
-    let last = logits.narrow(0, logits.dim(0)? - 1, 1)?.narrow(1, 0, policy.config.vocabulary)?;
+    let last = logits.narrow(0, logits.dim(0)? - 1, 1)?.narrow(1, 0, policy.parser.config.vocabulary)?;
     let draws = 4000;
     for temperature in [0.5f32, 1.0] {
         let scaled = (&last / f64::from(temperature))?;
@@ -116,7 +120,7 @@ fn first_tokens_are_distributed_as_the_softmax_says() -> Result<()> {
         let softmax: Vec<f32> =
             scaled.broadcast_sub(&log_sum.unsqueeze(1)?)?.exp()?.squeeze(0)?.to_vec1()?;
         let proposal = policy.propose_now(&[request(&image, draws, temperature, 11)])?.remove(0);
-        let mut counts = vec![0u32; policy.config.vocabulary];
+        let mut counts = vec![0u32; policy.parser.config.vocabulary];
         for candidate in &proposal.candidates {
             // A completion of no tokens drew the end at once.
             counts[candidate.tokens.first().map_or(2, |&token| token as usize)] += 1;
@@ -143,8 +147,8 @@ fn first_tokens_are_distributed_as_the_softmax_says() -> Result<()> {
 #[test]
 fn log_probabilities_are_those_of_temperature_one() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
-    let image = image(5, policy.image_size().0);
-    let prompt = policy.prompter.ids(INSTRUCTION)?;
+    let image = image(5, policy.info().image_size.0);
+    let prompt = policy.parser.prompter.ids(INSTRUCTION)?;
     for temperature in [0.0, 0.6, 1.0] {
         let proposal = policy.propose_now(&[request(&image, 3, temperature, 3)])?.remove(0);
         for candidate in proposal.candidates {
@@ -153,7 +157,7 @@ fn log_probabilities_are_those_of_temperature_one() -> Result<()> {
             let logits = &outputs[outputs.len() - 1].1;
             let count = candidate.tokens.len();
             let rows = logits.narrow(0, logits.dim(0)? - count - 1, count + 1)?;
-            let rows = rows.narrow(1, 0, policy.config.vocabulary)?;
+            let rows = rows.narrow(1, 0, policy.parser.config.vocabulary)?;
             let log_sums: Vec<f32> = rows.log_sum_exp(D::Minus1)?.to_vec1()?;
             let rows: Vec<Vec<f32>> = rows.to_vec2()?;
             let likelihood = |row: usize, id: u32| rows[row][id as usize] - log_sums[row];
@@ -175,20 +179,20 @@ fn log_probabilities_are_those_of_temperature_one() -> Result<()> {
 fn confidence_is_the_sum_over_each_tags_text_and_each_action_number() -> Result<()> {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/bridge-small");
     for policy in [Vla::load(&shipped, DeviceName::Cpu)?, tiny("tiny", Backend::Kernels)?] {
-        let image = image(6, policy.image_size().0);
+        let image = image(6, policy.info().image_size.0);
         let proposal = policy.propose_now(&[request(&image, 8, 1.0, 4)])?.remove(0);
         for Candidate { tokens, log_probabilities, .. } in proposal.candidates {
-            let (mut expected, mut actions) = ([0.0; PARTS], TAGS.len());
+            let (mut expected, mut actions) = (vec![0.0; PARTS], TAGS.len());
             for (index, log_probability) in log_probabilities.iter().enumerate() {
-                let part = if policy.bins.contains(tokens[index]) {
+                let part = if policy.parser.bins.contains(tokens[index]) {
                     actions += 1;
                     (actions - 1).min(PARTS - 1)
                 } else {
-                    section(&policy.decode_text(&tokens[..=index]))
+                    section(&policy.parser().text(&tokens[..=index]))
                 };
                 expected[part] += log_probability.max(-8.0);
             }
-            assert_eq!(policy.confidence(&tokens, &log_probabilities), expected);
+            assert_eq!(policy.parser().confidence(&tokens, &log_probabilities), expected);
         }
     }
     Ok(())
@@ -233,15 +237,15 @@ fn tokens_parse_strictly() -> Result<()> {
     let golden = Golden::load(&fixtures().join("tiny/activations.safetensors"))?;
     let mut good = golden.ids("forced")?;
     assert_eq!(good.pop(), Some(2), "the golden completion ends with </s>");
-    let parsed = policy.parse(&good)?;
+    let parsed = policy.parser().parse(&good)?;
     assert_eq!(parsed.reasoning.subtask, "reach the spoon");
     assert_eq!(parsed.reasoning.visible_objects[1].bounding_box, [60, 62, 90, 98]);
     assert_eq!(parsed.reasoning.gripper_position, [[120, 84]]);
     // Digits 1, 64, 128, 129, 200, 255, 256 below a vocabulary of 960.
     assert_eq!(parsed.action_tokens, [959, 896, 832, 831, 760, 705, 704]);
-    assert!((parsed.action[0] + 0.03 - 0.06 * 0.5 / 255.0).abs() < 1e-7);
-    assert_eq!(parsed.action[6], 1.0);
-    let check = |ids: &[u32], expected: &str| match policy.parse(ids) {
+    assert!((parsed.actions.first()[0] + 0.03 - 0.06 * 0.5 / 255.0).abs() < 1e-7);
+    assert_eq!(parsed.actions.first()[6], 1.0);
+    let check = |ids: &[u32], expected: &str| match policy.parser().parse(ids) {
         Err(malformed) => assert_eq!(malformed.to_string(), expected),
         Ok(_) => panic!("expected a refusal: {expected}"),
     };
