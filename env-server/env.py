@@ -74,7 +74,7 @@ def make_env(
     return {
         _SUITE: {
             index: kind([partial(LeRobotEnv, task, connect, image_side)] * n_envs)
-            for index, task in enumerate(tasks.load().values())
+            for index, task in enumerate(tasks.choose(tasks.load(), None))
         }
     }
 

@@ -52,10 +52,10 @@ def _parser() -> argparse.ArgumentParser:
     check = commands.add_parser("health", help="ask servers whether they still work")
     health.add_arguments(check)
 
-    trace = commands.add_parser("trace", help="print every number of an episode")
-    trace.add_argument("--task", required=True)
-    trace.add_argument("--layout", type=int, help="default: drawn from the seed")
-    trace.add_argument("--seed", type=int, default=0)
+    trace = commands.add_parser("trace", help="print every number of episodes")
+    _add_tasks(trace)
+    trace.add_argument("--layouts", nargs="+", type=int, help="default: drawn from the seeds")
+    trace.add_argument("--seeds", nargs="+", type=int, default=[0])
     trace.add_argument("--side", type=int, default=128, help="of the image (default: 128)")
     trace.add_argument(
         "--actions", type=Path, metavar="FILE", help="7 numbers per line (default: the expert's)"
@@ -75,7 +75,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_tasks(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="default: all")
+    parser.add_argument(
+        "--tasks",
+        nargs="+",
+        metavar="TASK",
+        help="TASK, TASK/VARIANT, TASK/all, or all (default: every task in its default variant)",
+    )
 
 
 def _demonstrate(arguments: argparse.Namespace) -> int:
@@ -110,11 +115,11 @@ def _bench(arguments: argparse.Namespace) -> int:
 def _trace(arguments: argparse.Namespace) -> int:
     from rever_env import tasks, trace
 
-    (task,) = tasks.choose(tasks.load(), [arguments.task])
-    for line in trace.lines(
-        task, arguments.layout, arguments.seed, arguments.actions, arguments.side
-    ):
-        print(line)
+    layouts = arguments.layouts or [None]
+    starts = [(layout, seed) for layout in layouts for seed in arguments.seeds]
+    for task in tasks.choose(tasks.load(), arguments.tasks):
+        for line in trace.lines(task, starts, arguments.actions, arguments.side):
+            print(line)
     return 0
 
 

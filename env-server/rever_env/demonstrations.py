@@ -128,6 +128,7 @@ def record(world: World, seed: int, noisy: bool) -> dict[str, Any] | None:
         "reasoning": np.array(texts),
         "instruction": np.array(world.task.instruction),
         "task": np.array(world.task.name),
+        "variant": np.array(world.task.variant),
         "seed": np.array(seed, dtype=np.int64),
         "success": np.array(True),
     }
@@ -146,25 +147,31 @@ class Share:
     stride: int
 
 
+def folder(out: Path, task: Task) -> Path:
+    """Where a task's episodes lie: TASK, or TASK@VARIANT for another than the default one."""
+    return out / str(task.id).replace("/", "@")
+
+
 def record_share(share: Share) -> dict[str, tuple[int, int]]:
     """Records what is missing; returns kept and failed episodes per task.
 
     A failed episode leaves an empty .failed file, so that a resumed run does not repeat it.
     """
-    counts = {task.name: [0, 0] for task in share.tasks}
+    counts = {str(task.id): [0, 0] for task in share.tasks}
     worlds = [World(task) for task in share.tasks]
     try:
         # Tasks take turns, so that an interrupted run is balanced.
         for index in range(share.offset, share.episodes, share.stride):
             for world in worlds:
                 seed = share.seed + index
-                path = share.out / world.task.name / f"{seed}.npz"
+                name = str(world.task.id)
+                path = folder(share.out, world.task) / f"{seed}.npz"
                 failure = path.with_suffix(".failed")
                 if path.exists() or failure.exists():
-                    counts[world.task.name][0 if path.exists() else 1] += 1
+                    counts[name][0 if path.exists() else 1] += 1
                     continue
                 episode = record(world, seed, share.noisy)
-                counts[world.task.name][0 if episode is not None else 1] += 1
+                counts[name][0 if episode is not None else 1] += 1
                 if episode is None:
                     failure.touch()
                     continue
@@ -190,7 +197,7 @@ def demonstrate(
 ) -> dict[str, tuple[int, int]]:
     """Records episodes per task from seeds seed.. on; existing files are kept as they are."""
     for task in tasks:
-        (out / task.name).mkdir(parents=True, exist_ok=True)
+        folder(out, task).mkdir(parents=True, exist_ok=True)
     shares = [
         Share(tuple(tasks), episodes, seed, out, noisy, offset, processes)
         for offset in range(processes)
@@ -210,9 +217,9 @@ def demonstrate(
             report(f"{done} of {total} episodes, {seconds:.0f} s, about {left:.0f} s left")
         results = [future.result() for future in futures]
     return {
-        task.name: (
-            sum(result[task.name][0] for result in results),
-            sum(result[task.name][1] for result in results),
+        str(task.id): (
+            sum(result[str(task.id)][0] for result in results),
+            sum(result[str(task.id)][1] for result in results),
         )
         for task in tasks
     }
@@ -223,5 +230,5 @@ def _recorded(tasks: list[Task], seeds: range, out: Path) -> int:
     return sum(
         entry.suffix in (".npz", ".failed") and int(entry.stem) in seeds
         for task in tasks
-        for entry in (out / task.name).iterdir()
+        for entry in folder(out, task).iterdir()
     )

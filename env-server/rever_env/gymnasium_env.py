@@ -19,7 +19,7 @@ from rever_env.world import Observation, World
 
 
 class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
-    """A task as a Gymnasium environment.
+    """A task as a Gymnasium environment. variant: one of the task's in tasks.toml.
 
     observation: image uint8 (height, width, 3), state float32 (8,) in Bridge's order,
     instruction text. action: float64 (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open).
@@ -31,13 +31,14 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
     def __init__(
         self,
         task: str,
+        variant: str = tasks.DEFAULT,
         render_mode: str | None = "rgb_array",
         image_height: int = 128,
         image_width: int = 128,
     ) -> None:
         check_render_mode(render_mode)
         self.render_mode = render_mode
-        description = tasks.load()[task]
+        description = tasks.find(tasks.load(), task, variant)
         self.world = World(description, image_height, image_width)
         self._last: Observation | None = None
         self.observation_space = observation_space(

@@ -1,4 +1,7 @@
-"""The Gymnasium ids of every task and of environments elsewhere; importing rever_env adds them."""
+"""The Gymnasium ids of every task and of environments elsewhere; importing rever_env adds them.
+
+A task's variants have its id: gymnasium.make(ID, variant=NAME).
+"""
 
 from typing import Any
 
@@ -11,13 +14,15 @@ REMOTE_ID = "rever/Remote-v1"
 
 def register() -> None:
     """Adds what is not there yet; imports no simulator."""
+    offered = tasks.load().values()
     ids: dict[str, dict[str, Any]] = {
         task.gymnasium_id: {
             "entry_point": "rever_env.gymnasium_env:BridgeEnv",
             "kwargs": {"task": task.name},
-            "max_episode_steps": task.steps_max,
+            # The environment itself truncates a variant with fewer steps.
+            "max_episode_steps": max(one.steps_max for one in offered if one.name == task.name),
         }
-        for task in tasks.load().values()
+        for task in offered
     }
     ids[REMOTE_ID] = {
         "entry_point": "rever_env.remote:RemoteEnv",

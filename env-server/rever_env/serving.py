@@ -42,6 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="find others by multicast; without --listen, on every interface",
     )
+    parser.add_argument(
+        "--tasks",
+        nargs="+",
+        metavar="TASK",
+        help="offer these alone: TASK, TASK/VARIANT, TASK/all (default: every task and variant)",
+    )
     parser.add_argument("--fleet", default="local", help="who meets whom (default: local)")
     parser.add_argument("--sessions", type=int, default=16, help="at once (default: 16)")
     parser.add_argument(
@@ -227,7 +233,8 @@ def _worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
         )
     if arguments.gymnasium:
         return _gymnasium_worlds(arguments, idle_max)
-    return Worlds(tasks.load(), idle_max)
+    chosen = tasks.choose(tasks.load(), arguments.tasks or [tasks.ALL])
+    return Worlds({str(task.id): task for task in chosen}, idle_max)
 
 
 def _gymnasium_worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":

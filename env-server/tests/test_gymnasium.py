@@ -10,6 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import rever_env  # noqa: F401  (registers the ids)
+from rever_env.fault import InvalidReset
 from rever_env.protocol import Statistics
 from rever_env.tasks import Task
 from rever_env.world import World
@@ -26,13 +27,13 @@ def test_the_checker_passes_without_a_warning(task: Task) -> None:
     assert task.gymnasium_id == IDS[task.name]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        environment = gymnasium.make(task.gymnasium_id)
+        environment = gymnasium.make(task.gymnasium_id, variant=task.variant)
         check_env(environment.unwrapped)
         environment.close()
 
 
 def test_it_is_the_same_world(task: Task, world: World) -> None:
-    environment = gymnasium.make(task.gymnasium_id)
+    environment = gymnasium.make(task.gymnasium_id, variant=task.variant)
     observation, info = environment.reset(seed=9, options={"layout": 4})
     expected = world.reset(layout=4, seed=9)
     assert np.array_equal(observation["image"], expected.image)
@@ -51,6 +52,11 @@ def test_unknown_options_are_refused(task: Task) -> None:
     with pytest.raises(ValueError, match="expected only 'layout'"):
         environment.reset(options={"configuraton": 4})
     environment.close()
+
+
+def test_a_variant_that_is_not_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(InvalidReset, match="default, paraphrase, distractors, got 'upside-down'"):
+        gymnasium.make("rever/SpoonOnTowel-v1", variant="upside-down")
 
 
 def test_asynchronous_vectors_draw_in_their_own_processes() -> None:
