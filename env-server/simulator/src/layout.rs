@@ -62,10 +62,7 @@ fn draw(task: &Task, seed: u64) -> Result<Layout, Fault> {
             return Ok(layout);
         }
     }
-    Err(Fault::Wrong(format!(
-        "task {}, seed {seed}: no free layout in {DRAWS_MAX} draws",
-        task.id
-    )))
+    Err(Fault::Wrong(format!("task {}, seed {seed}: no free layout in {DRAWS_MAX} draws", task.id)))
 }
 
 fn draw_distractors(
@@ -74,8 +71,7 @@ fn draw_distractors(
     generator: &mut SplitMix64,
     seed: u64,
 ) -> Result<Vec<Pose>, Fault> {
-    let mut placed =
-        vec![(layout.source_x, layout.source_y), (layout.target_x, layout.target_y)];
+    let mut placed = vec![(layout.source_x, layout.source_y), (layout.target_x, layout.target_y)];
     let mut poses = Vec::new();
     for distractor in &task.rule.distractors {
         let mut draw = || Pose {

@@ -33,7 +33,8 @@ pub struct Names {
 
 /// Compiles a task's scene.
 pub fn compile(task: &Task) -> Result<(Arc<MjModel>, Names), Fault> {
-    let cannot = |error: String| Fault::Internal(format!("cannot compile task {}: {error}", task.id));
+    let cannot =
+        |error: String| Fault::Internal(format!("cannot compile task {}: {error}", task.id));
     let text = mjcf::scene(task).map_err(|error| cannot(format!("{error:#}")))?;
     let model = MjModel::from_xml_string(&text).map_err(|error| cannot(error.to_string()))?;
     let timestep = model.opt().timestep;
