@@ -5,14 +5,15 @@ import os
 import sys
 from pathlib import Path
 
-from rever_env import health, serving
+from rever_env import health, opengl, serving
 
 
 def main() -> int:
     """Parses, calls one library function, prints one error, returns the exit status."""
-    os.environ.setdefault("MUJOCO_GL", "egl")  # whatever screen there is
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # Gymnasium's own pictures need no screen
     arguments = _parser().parse_args()
+    for warning in opengl.isolate_process():
+        print(f"warning: {warning}", file=sys.stderr)
+    os.environ["SDL_VIDEODRIVER"] = "dummy"  # Gymnasium's own images need no screen
     from rever_env.fault import Fault
 
     try:
