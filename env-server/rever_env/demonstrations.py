@@ -17,7 +17,7 @@ from rever_env.expert import Decision
 from rever_env.tasks import Task
 from rever_env.world import Observation, World
 
-SETTLE_STEPS = 6  # kept after released success, so that letting go and staying are learnt
+SETTLE_STEPS = 6  # steps recorded after the object was released on its target
 _NOISE_POSITION = 0.005  # metres, stationary standard deviation
 _NOISE_YAW = 0.04  # rad
 _NOISE_REVERSION = 0.3  # per step
@@ -69,7 +69,7 @@ class Noise:
 
 @dataclass
 class Annotator:
-    """Writes the reasoning of a step; remembers boxes for objects that are hidden for a while."""
+    """Writes the reasoning of a step; keeps the last boxes of objects that are hidden."""
 
     world: World
     boxes: list[reasoning.Box | None]
@@ -136,7 +136,7 @@ def record(world: World, seed: int, noisy: bool) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Share:
-    """What one process records: every stride-th of the episodes, from an offset on."""
+    """The episodes of one process: every stride-th, starting at an offset."""
 
     tasks: tuple[Task, ...]
     episodes: int
@@ -148,19 +148,19 @@ class Share:
 
 
 def folder(out: Path, task: Task) -> Path:
-    """Where a task's episodes lie: TASK, or TASK@VARIANT for another than the default one."""
+    """The folder of a task's episodes: TASK, or TASK@VARIANT for another than the default one."""
     return out / str(task.id).replace("/", "@")
 
 
 def record_share(share: Share) -> dict[str, tuple[int, int]]:
-    """Records what is missing; returns kept and failed episodes per task.
+    """Records missing episodes; returns kept and failed episodes per task.
 
     A failed episode leaves an empty .failed file, so that a resumed run does not repeat it.
     """
     counts = {str(task.id): [0, 0] for task in share.tasks}
     worlds = [World(task) for task in share.tasks]
     try:
-        # Tasks take turns, so that an interrupted run is balanced.
+        # Tasks alternate, so that an interrupted run has as many episodes of each.
         for index in range(share.offset, share.episodes, share.stride):
             for world in worlds:
                 seed = share.seed + index
@@ -195,7 +195,7 @@ def demonstrate(
     processes: int,
     report: Callable[[str], None],
 ) -> dict[str, tuple[int, int]]:
-    """Records episodes per task from seeds seed.. on; existing files are kept as they are."""
+    """Records episodes of every task with seeds from seed on; existing files are kept."""
     for task in tasks:
         folder(out, task).mkdir(parents=True, exist_ok=True)
     shares = [
@@ -206,7 +206,7 @@ def demonstrate(
     total = episodes * len(tasks)
     seeds = range(seed, seed + episodes)
     before = _recorded(tasks, seeds, out)
-    # Fresh processes: an OpenGL context does not survive a fork.
+    # Not forked: other libraries' threads do not survive a fork.
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(record_share, share) for share in shares]
         while not all(future.done() for future in futures):
@@ -226,9 +226,9 @@ def demonstrate(
 
 
 def _recorded(tasks: list[Task], seeds: range, out: Path) -> int:
-    """How many of the episodes are there; the directory may hold those of other seeds as well."""
+    """How many of the episodes are recorded; the folder may contain other seeds."""
     return sum(
-        entry.suffix in (".npz", ".failed") and int(entry.stem) in seeds
+        entry.suffix in (".npz", ".failed") and entry.stem.isdecimal() and int(entry.stem) in seeds
         for task in tasks
         for entry in folder(out, task).iterdir()
     )

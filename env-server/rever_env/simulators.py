@@ -1,11 +1,11 @@
-"""The simulators that a server can offer: their options on the command line, and their worlds."""
+"""The simulators that a server can offer: their command-line options and their worlds."""
 
 import argparse
-import json
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rever_env import opengl
+from rever_env.argument_types import count, json_object
 from rever_env.fault import RendererUnavailable
 from rever_env.protocol import limits
 
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kinds.add_argument("--gymnasium", nargs="+", metavar="ID", help="environments of Gymnasium")
     group.add_argument(
         "--horizon",
-        type=_count,
+        type=count,
         metavar="STEPS",
         help="control steps of episodes of robosuite's own tasks and of Gymnasium ids without a "
         f"limit (default: {_HORIZON})",
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="packages that register the ids when they are imported",
     )
     gymnasium.add_argument(
-        "--arguments", type=_json_object, metavar="JSON", help="arguments of gymnasium.make"
+        "--arguments", type=json_object, metavar="JSON", help="arguments of gymnasium.make"
     )
     gymnasium.add_argument(
         "--wrapper", metavar="MODULE:CLASS", help="applied to each environment, outermost"
@@ -188,19 +188,3 @@ def _check_used(arguments: argparse.Namespace) -> None:
         if getattr(arguments, option) is not None and not is_used:
             name = "import" if option == "imports" else option.replace("_", "-")
             raise UnusedOption(f"--{name} has no effect without {wanted}")
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1, got {text}")
-    return int(text)
-
-
-def _json_object(text: str) -> dict[str, Any]:
-    try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"expected a JSON object, got {text}: {error}") from error
-    if not isinstance(value, dict):
-        raise argparse.ArgumentTypeError(f"expected a JSON object, got {text}")
-    return value
