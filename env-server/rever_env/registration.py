@@ -30,7 +30,7 @@ def register() -> None:
     ids[REMOTE_ID] = {
         "entry_point": "rever_env.remote:RemoteEnv",
         # Its server truncates.
-        "vector_entry_point": "rever_env.remote:RemoteVectorEnv",
+        "vector_entry_point": "rever_env.remote_vector:RemoteVectorEnv",
     }
     for name, arguments in ids.items():
         if name not in gymnasium.registry:

@@ -1,20 +1,18 @@
 """Gymnasium's spaces for what the protocol describes."""
 
-import operator
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
+from rever_env.instruction import Instruction
 from rever_env.protocol import Dimension
 
 RANDOM_SEEDS = 1_000_000_000  # seeds drawn by reset(seed=None) lie below this
 
 
-def observation_space(
-    height: int, width: int, instruction: str, state: Sequence[Dimension]
-) -> spaces.Dict:
+def observation_space(height: int, width: int, state: Sequence[Dimension]) -> spaces.Dict:
     """image uint8 (height, width, 3), state float32 (as many as described,), instruction text.
 
     Without pixels there is no image, and without numbers no state.
@@ -24,9 +22,7 @@ def observation_space(
         fields["image"] = spaces.Box(0, 255, (height, width, 3), np.uint8)
     if state:
         fields["state"] = box(state)
-    fields["instruction"] = spaces.Text(
-        max_length=max(len(instruction), 1), charset="".join(sorted(set(instruction))) or " "
-    )
+    fields["instruction"] = Instruction()
     return spaces.Dict(fields)
 
 
@@ -53,27 +49,9 @@ def box(dimensions: Sequence[Dimension]) -> spaces.Box:
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
 
-def layout_of(options: dict[str, Any] | None) -> int | None:
-    """The fixed layout that reset's options ask for; ValueError for any other option."""
-    options = options or {}
-    unknown = set(options) - {"layout"}
-    if unknown:
-        raise ValueError(f"reset options: expected only 'layout', got {sorted(unknown)}")
-    layout = options.get("layout")
-    if layout is None:
-        return None
-    try:
-        number = operator.index(layout)
-    except TypeError:
-        number = -1
-    if isinstance(layout, bool) or not 0 <= number < 1 << 32:
-        raise ValueError(
-            f"reset options: layout: expected a whole number from 0 to 4294967295, got {layout!r}"
-        )
-    return number
-
-
-def check_render_mode(render_mode: str | None) -> None:
-    """ValueError for a mode that these environments do not have."""
-    if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"render mode: expected None or 'rgb_array', got {render_mode!r}")
+def metadata_of(control_hz: float | None) -> dict[str, Any]:
+    """An environment's metadata: videos play at its control rate, where that is known."""
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
+    if control_hz is not None:
+        metadata["render_fps"] = int(control_hz) if control_hz.is_integer() else control_hz
+    return metadata

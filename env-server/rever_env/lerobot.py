@@ -1,0 +1,105 @@
+"""The tasks under LeRobot's names: what its EnvHub asks for, as vectors of environments.
+
+Observations have LeRobot's keys: pixels (uint8, height x width x 3) and agent_pos (float32, 8).
+"""
+
+import multiprocessing
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import EzPickle
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from numpy.typing import NDArray
+
+from rever_env import tasks
+
+_SUITE = "rever"
+_SIDE = 256  # pixels
+Fields = dict[str, Any]
+
+
+class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
+    """One task. connect: a server elsewhere; None for a world in this process."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
+
+    def __init__(self, task: str, connect: str | None = None, image_side: int = _SIDE) -> None:
+        EzPickle.__init__(self, task, connect, image_side)
+        if connect is None:
+            from rever_env.gymnasium_env import BridgeEnv
+
+            self._inner: Any = BridgeEnv(task, image_height=image_side, image_width=image_side)
+        else:
+            from rever_env.remote import RemoteEnv
+
+            self._inner = RemoteEnv(connect, task, image_height=image_side, image_width=image_side)
+        offered = tasks.load()[task]
+        self.render_mode = "rgb_array"
+        self.metadata = self._inner.metadata
+        self.task = task
+        self.task_description = offered.instruction
+        self._max_episode_steps = offered.steps_max
+        seen = self._inner.observation_space
+        self.observation_space = spaces.Dict({"pixels": seen["image"], "agent_pos": seen["state"]})
+        self.action_space = self._inner.action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: Fields | None = None
+    ) -> tuple[Fields, Fields]:
+        """As of the environment inside; LeRobot's own options are left out."""
+        super().reset(seed=seed)
+        own = {name: value for name, value in (options or {}).items() if name == "layout"}
+        observation, info = self._inner.reset(seed=seed, options=own)
+        return self._fields(observation), {**info, "is_success": False}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Fields, float, bool, bool, Fields]:
+        """As of the environment inside."""
+        observation, reward, terminated, truncated, info = self._inner.step(action)
+        return self._fields(observation), reward, terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8]:
+        """The last observation's image."""
+        image: NDArray[np.uint8] = self._inner.render()
+        return image
+
+    def close(self) -> None:
+        """Closes the environment inside."""
+        self._inner.close()
+
+    def _fields(self, observation: Fields) -> Fields:
+        self.task_description = observation["instruction"]  # of this episode
+        return {"pixels": observation["image"], "agent_pos": observation["state"]}
+
+
+def make_env(
+    n_envs: int = 1, use_async_envs: bool = False, cfg: Any = None
+) -> dict[str, dict[int, VectorEnv[Any, Any, Any]]]:
+    """Every task by its number, `n_envs` environments each.
+
+    cfg may have `connect`, the endpoint of a server or router elsewhere (None: worlds in this
+    process), `image_side` in pixels (default: 256), and `tasks`, names of the tasks (default: all).
+
+    The last step begins the next episode (SAME_STEP): LeRobot reads an episode's success from
+    info["final_info"], which only this mode has.
+    """
+    connect = getattr(cfg, "connect", None)
+    image_side = getattr(cfg, "image_side", _SIDE)
+    names = getattr(cfg, "tasks", None)
+    chosen = {task.name for task in tasks.choose(tasks.load(), names)}
+    # A forked process cannot use the network that its parent has opened.
+    forkserver = "forkserver" in multiprocessing.get_all_start_methods()
+    start_method = "forkserver" if forkserver else "spawn"
+    vectors: dict[int, VectorEnv[Any, Any, Any]] = {}
+    for index, name in enumerate(tasks.load()):
+        if name not in chosen:
+            continue
+        makers = [partial(LeRobotEnv, name, connect, image_side)] * n_envs
+        vectors[index] = (
+            AsyncVectorEnv(makers, context=start_method, autoreset_mode=AutoresetMode.SAME_STEP)
+            if use_async_envs
+            else SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+        )
+    return {_SUITE: vectors}
