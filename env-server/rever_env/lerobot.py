@@ -22,7 +22,11 @@ Fields = dict[str, Any]
 
 
 class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
-    """One task. connect: a server elsewhere; None for a world in this process."""
+    """One task. connect: a server elsewhere; None for a world in this process.
+
+    info["is_success"] is the episode's result, False before the last step: LeRobot counts an
+    episode as a success where any of its steps says so.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
 
@@ -58,6 +62,7 @@ class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
     def step(self, action: NDArray[np.float32]) -> tuple[Fields, float, bool, bool, Fields]:
         """As of the environment inside."""
         observation, reward, terminated, truncated, info = self._inner.step(action)
+        info["is_success"] = info["is_success"] and (terminated or truncated)
         return self._fields(observation), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8]:

@@ -111,7 +111,8 @@ class Network:
         self._is_routed = bool(self.zenoh.info.routers_zid())
         self._declared: list[Any] = []
         self._is_closed = False
-        self.is_absent = False  # the server's token is gone, and perhaps the server
+        self.is_absent = True  # no token of the server is seen (yet, or any more)
+        self._was_seen = False
         self._connected_since: float | None = None  # while it is absent
         self.restored_at = 0.0  # when the server's token came back, if it ever did
         _open_networks.add(self)
@@ -180,9 +181,9 @@ class Network:
 
         def on_token(sample: Any) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                if self.is_absent:
+                if self.is_absent and self._was_seen:
                     self.restored_at = time.monotonic()
-                self.is_absent = False
+                self.is_absent, self._was_seen = False, True
             else:
                 self._connected_since = None
                 self.is_absent = True
