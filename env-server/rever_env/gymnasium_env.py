@@ -27,7 +27,8 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]], EzPickle):
     """One of the four Bridge tasks: a WidowX arm on a table, 5 control steps per second.
 
     Arguments
-        task: SIMPLER's name. variant: one of the task's in tasks.toml. image_height, image_width: pixels, 1 to 1024; 0 and 0 for no image.
+        task: SIMPLER's name. variant: one of the task's in tasks.toml.
+        image_height, image_width: pixels, 1 to 1024; 0 and 0 for no image.
 
     Observation: image uint8 (height, width, 3); state float32 (8,): x y z (m) roll pitch yaw (rad)
     of the gripper in the base's frame, 0, gripper opening 0 to 1; instruction text.

@@ -22,8 +22,9 @@ Fields = dict[str, Any]
 
 
 class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
-    """One task. connect: a server elsewhere; None for a world in this process.
+    """One task, as TASK or TASK/VARIANT.
 
+    connect: a server elsewhere; None for a world in this process.
     info["is_success"] is the episode's result, False before the last step: LeRobot counts an
     episode as a success where any of its steps says so.
     """
@@ -32,15 +33,17 @@ class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
 
     def __init__(self, task: str, connect: str | None = None, image_side: int = _SIDE) -> None:
         EzPickle.__init__(self, task, connect, image_side)
+        name, variant = tasks.TaskId.parse(task)
+        sizes: Fields = {"image_height": image_side, "image_width": image_side}
         if connect is None:
             from rever_env.gymnasium_env import BridgeEnv
 
-            self._inner: Any = BridgeEnv(task, image_height=image_side, image_width=image_side)
+            self._inner: Any = BridgeEnv(name, variant, **sizes)
         else:
             from rever_env.remote import RemoteEnv
 
-            self._inner = RemoteEnv(connect, task, image_height=image_side, image_width=image_side)
-        offered = tasks.load()[task]
+            self._inner = RemoteEnv(connect, name, variant, **sizes)
+        offered = tasks.find(tasks.load(), name, variant)
         self.render_mode = "rgb_array"
         self.metadata = self._inner.metadata
         self.task = task
@@ -85,23 +88,20 @@ def make_env(
     """Every task by its number, `n_envs` environments each.
 
     cfg may have `connect`, the endpoint of a server or router elsewhere (None: worlds in this
-    process), `image_side` in pixels (default: 256), and `tasks`, names of the tasks (default: all).
+    process), `image_side` in pixels (default: 256), and `tasks`, a list of TASK or TASK/VARIANT
+    (default: every task).
 
     The last step begins the next episode (SAME_STEP): LeRobot reads an episode's success from
     info["final_info"], which only this mode has.
     """
     connect = getattr(cfg, "connect", None)
     image_side = getattr(cfg, "image_side", _SIDE)
-    names = getattr(cfg, "tasks", None)
-    chosen = {task.name for task in tasks.choose(tasks.load(), names)}
     # A forked process cannot use the network that its parent has opened.
     forkserver = "forkserver" in multiprocessing.get_all_start_methods()
     start_method = "forkserver" if forkserver else "spawn"
     vectors: dict[int, VectorEnv[Any, Any, Any]] = {}
-    for index, name in enumerate(tasks.load()):
-        if name not in chosen:
-            continue
-        makers = [partial(LeRobotEnv, name, connect, image_side)] * n_envs
+    for index, task in enumerate(tasks.choose(tasks.load(), getattr(cfg, "tasks", None))):
+        makers = [partial(LeRobotEnv, str(task.id), connect, image_side)] * n_envs
         vectors[index] = (
             AsyncVectorEnv(makers, context=start_method, autoreset_mode=AutoresetMode.SAME_STEP)
             if use_async_envs

@@ -40,7 +40,8 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
 
     Arguments
         connect: endpoints of servers or of a router, as tcp/HOST:PORT or HOST:PORT, or one of them.
-        task: by default the first that the server offers. variant: "default" of a named task.
+        task: TASK or TASK/VARIANT; by default the first that the server offers. variant: instead
+        of /VARIANT.
         image_height, image_width: pixels, 1 to 1024; 0 and 0 for no image.
         fleet: namespace of the servers. server: id of one of them; by default the least used.
         expert: info has "expert_action", float32, what the server's scripted expert would do.

@@ -14,6 +14,7 @@ import zenoh
 
 from rever_env import endpoint, protocol
 from rever_env.serving import Endpoints
+from rever_env.tasks import TaskId
 
 _LOOK_SECS = 0.2  # between looks for a server
 _NOBODY_SECS = 2.0  # how long there may be no server at all
@@ -57,9 +58,10 @@ class Fleet:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What to open. task: None for the first that a server offers.
+    """What to open. task: None for the first that a server offers; or TASK, or TASK/VARIANT.
 
-    variant: None for "default" of a named task. Images of 0 x 0 pixels are none.
+    variant: None for the one that task names, "default" of TASK alone. Images of 0 x 0 pixels are
+    none.
     """
 
     task: str | None
@@ -68,19 +70,20 @@ class Wanted:
     image_width: int
     expert: bool
 
-    @property
-    def name(self) -> str:
-        """The task for messages."""
-        variant = self.variant if self.variant is not None or self.task is None else "default"
-        return f"{self.task or 'any task'} ({variant or 'any variant'})"
-
     def among(self, tasks: Sequence[protocol.TaskDescription]) -> protocol.TaskDescription | None:
         """The first of the tasks that is wanted."""
-        variant = "default" if self.variant is None and self.task is not None else self.variant
         for one in tasks:
-            if self.task in (None, one.task) and variant in (None, one.variant):
+            if self.variant is None:
+                if self.task in (None, str(TaskId(one.task, one.variant))):
+                    return one
+            elif self.task in (None, one.task) and self.variant == one.variant:
                 return one
         return None
+
+    def __str__(self) -> str:
+        if self.task is None or self.variant is None:
+            return self.task or f"any task in variant {self.variant}"
+        return str(TaskId(self.task, self.variant))
 
 
 class Network:
@@ -157,11 +160,11 @@ class Network:
             if free:
                 return max(free, key=lambda server: server.sessions_max - server.sessions)
             if found and not fitting:
-                offered = sorted(
-                    {f"{task.task} ({task.variant})" for one in found for task in one.tasks}
-                )
+                offered = {
+                    TaskId(task.task, task.variant): 0 for one in found for task in one.tasks
+                }
                 raise RemoteRefused(
-                    f"expected one of the tasks {', '.join(offered)}, got {wanted.name}"
+                    f"expected one of the tasks {', '.join(map(str, offered))}, got {wanted}"
                 )
             default = _WAIT_SECS if found else _NOBODY_SECS
             wait = default if fleet.wait_secs is None else fleet.wait_secs

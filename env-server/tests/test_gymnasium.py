@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import rever_env
+from rever_env.fault import InvalidReset
 from rever_env.protocol import Statistics
 from rever_env.tasks import Task
 from rever_env.world import World
@@ -33,13 +34,13 @@ def test_the_checker_passes_without_a_warning(task: Task) -> None:
     assert task.gymnasium_id == IDS[task.name]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        environment = gymnasium.make(task.gymnasium_id)
+        environment = gymnasium.make(task.gymnasium_id, variant=task.variant)
         check_env(environment.unwrapped)
         environment.close()
 
 
 def test_it_is_the_same_world(task: Task, world: World) -> None:
-    environment = gymnasium.make(task.gymnasium_id)
+    environment = gymnasium.make(task.gymnasium_id, variant=task.variant)
     observation, info = environment.reset(seed=9, options={"layout": 4})
     expected = world.reset(layout=4, seed=9)
     assert np.array_equal(observation["image"], expected.image)
@@ -54,14 +55,19 @@ def test_it_is_the_same_world(task: Task, world: World) -> None:
 
 
 def test_unknown_options_are_refused(task: Task) -> None:
-    environment = gymnasium.make(task.gymnasium_id)
+    environment = gymnasium.make(task.gymnasium_id, variant=task.variant)
     with pytest.raises(ValueError, match="expected only 'layout'"):
         environment.reset(options={"configuraton": 4})
     environment.close()
 
 
+def test_a_variant_that_is_not_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(InvalidReset, match="default, paraphrase, distractors, got 'upside-down'"):
+        gymnasium.make("rever/SpoonOnTowel-v1", variant="upside-down")
+
+
 def test_all_tasks_have_the_same_spaces() -> None:
-    environments = [rever_env.BridgeEnv(name, **SMALL) for name in TASKS]
+    environments = [rever_env.BridgeEnv(*task.id, **SMALL) for task in TASKS.values()]
     first = environments[0]
     for environment in environments:
         assert environment.observation_space == first.observation_space
@@ -108,7 +114,7 @@ def test_an_action_that_is_not_followed_is_told() -> None:
 
 
 def test_the_expert_is_followed_but_for_what_it_touches(task: Task, world: World) -> None:
-    environment = rever_env.BridgeEnv(task.name, image_height=0, image_width=0)
+    environment = rever_env.BridgeEnv(*task.id, image_height=0, image_width=0)
     environment.reset(seed=3)
     followed = []
     for _ in range(30):
@@ -166,9 +172,7 @@ def test_wrong_actions_are_refused(action: Any, words: str, endpoint: str) -> No
 
 
 def test_wrong_names_and_seeds_are_refused() -> None:
-    with pytest.raises(
-        ValueError, match=r"task: expected one of widowx_spoon_on_towel, .* 'bogus'"
-    ):
+    with pytest.raises(InvalidReset, match=r"one of the tasks widowx_spoon_on_towel, .* 'bogus'"):
         rever_env.BridgeEnv("bogus")
     environment = rever_env.BridgeEnv(CUBE, **SMALL)
     for seed in (-1, 1.0, 1 << 53):

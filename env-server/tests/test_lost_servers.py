@@ -72,7 +72,7 @@ def test_a_server_with_another_task_does_not_take_a_lost_ones_place() -> None:
         remote.reset(seed=0)
     process = serve(endpoint, "--gymnasium", "CartPole-v1")
     try:
-        with pytest.raises(ValueError, match=r"tasks CartPole-v1 .* got widowx_spoon_on_towel"):
+        with pytest.raises(ValueError, match="tasks CartPole-v1, got widowx_spoon_on_towel"):
             remote.reset(seed=0)
         remote.close()
     finally:

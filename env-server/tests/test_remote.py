@@ -18,7 +18,6 @@ import rever_env
 from rever_env import protocol
 from rever_env.remote_session import RemoteFault, RemoteRefused
 from rever_env.tasks import Task
-from rever_env.world import World
 
 SPOON = "widowx_spoon_on_towel"
 STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
@@ -69,10 +68,11 @@ def test_a_gymnasium_environment_is_the_same_behind_a_server() -> None:
         remote.close()
 
 
-def test_it_is_the_same_environment(endpoint: str, task: Task, world: World) -> None:
+def test_it_is_the_same_environment(endpoint: str, task: Task) -> None:
     """Spaces, observations and info, for actions of any size."""
-    remote = rever_env.RemoteEnv(endpoint, task.name, expert=True)
-    local = rever_env.BridgeEnv(task.name)
+    remote = rever_env.RemoteEnv(endpoint, task.name, task.variant, expert=True)
+    local = rever_env.BridgeEnv(*task.id)
+    assert remote.session.task.variant == task.variant
     assert remote.observation_space == local.observation_space
     assert remote.action_space == local.action_space
     assert remote.metadata == local.metadata
@@ -226,6 +226,28 @@ def stepped(number: int) -> protocol.Stepped:
         False,
     )
     return protocol.Stepped(number, transition, (), 0)
+
+
+def test_a_session_that_the_server_ended_says_why_and_reset_opens_another(endpoint: str) -> None:
+    remote = rever_env.RemoteEnv(endpoint, SPOON, image_height=0, image_width=0)
+    remote.reset(seed=1)
+    remote.session._network._declared.pop().undeclare()  # the holder's token
+    with pytest.raises(RemoteFault, match="ended: its holder is gone"):
+        remote.step(STILL)
+    with pytest.raises(RemoteFault, match="the session is lost, and reset opens a new one"):
+        remote.step(STILL)
+    remote.reset(seed=1)
+    remote.step(STILL)
+    remote.close()
+
+
+def test_a_task_may_be_named_with_its_variant(endpoint: str) -> None:
+    remote = rever_env.RemoteEnv(endpoint, f"{SPOON}/distractors", image_height=0, image_width=0)
+    assert (remote.session.task.task, remote.session.task.variant) == (SPOON, "distractors")
+    remote.reset(seed=0)
+    remote.close()
+    with pytest.raises(RemoteRefused, match=f"{SPOON}/distractors, .* got {SPOON}/upside-down"):
+        rever_env.RemoteEnv(endpoint, SPOON, "upside-down")
 
 
 def test_no_step_follows_one_whose_reply_was_not_taken(endpoint: str) -> None:
