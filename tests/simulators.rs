@@ -2,12 +2,12 @@
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
 use agent::setup::simulators_environment;
 use agent::simulator::{ServerProgram, Simulator};
-use agent::suite::TASKS;
 use serde_json::Value;
 
 use crate::harness::{python, repository, rever, run, succeed, text};
@@ -52,48 +52,98 @@ fn native() -> &'static ServerProgram {
 }
 
 fn trace(program: &ServerProgram, arguments: &[&str]) -> Vec<Value> {
-    let said = succeed(program.command().arg("trace").args(arguments));
+    let said = succeed(program.command().args(["trace", "--tasks", "all"]).args(arguments));
     said.lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect()
 }
 
-/// Joint positions, velocities, state, the expert's action, statistics and the image of every step.
-fn assert_equal_traces(arguments: &[&str]) {
+/// Joint positions, velocities, state, the expert's action, statistics and the image of every step of every task in
+/// every variant. Returns how many lines there were.
+fn assert_equal_traces(arguments: &[&str]) -> usize {
     let in_python = ServerProgram::Python(python().clone());
     let (expected, got) = (trace(&in_python, arguments), trace(native(), arguments));
-    assert!(expected.len() > 60, "{arguments:?}: expected a reset and an episode's steps");
     assert_eq!(expected.len(), got.len(), "{arguments:?}");
-    for (step, (expected, got)) in expected.iter().zip(&got).enumerate() {
-        assert_eq!(expected, got, "{arguments:?}: step {step}");
+    for (expected, got) in expected.iter().zip(&got) {
+        assert_eq!(expected, got, "{arguments:?}");
     }
+    expected.len()
 }
 
 #[test]
 fn the_experts_episodes_are_equal_bit_for_bit() {
-    for task in TASKS {
-        assert_equal_traces(&["--task", task, "--seed", "5"]);
-    }
+    let lines = assert_equal_traces(&["--seeds", "5"]);
+    assert!(lines > 7 * 60, "expected a reset and an episode's steps of each, got {lines} lines");
 }
 
 #[test]
 fn wild_actions_are_equal_bit_for_bit() {
     let folder = tempfile::tempdir().expect("a folder");
-    let file = folder.path().join("actions.txt");
+    let file = wild_actions(folder.path(), 120);
+    let actions = ["--layouts", "7", "--side", "224", "--actions", &file];
+    let lines = assert_equal_traces(&actions);
+    assert!(lines > 7 * 60, "expected a reset and an episode's steps of each, got {lines} lines");
+}
+
+#[test]
+fn every_layout_and_random_ones_are_equal_bit_for_bit() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = wild_actions(folder.path(), 3);
+    let layouts: Vec<String> = (0..24).map(|layout| layout.to_string()).collect();
+    let seeds: Vec<String> = (0..24).map(|seed: u64| (seed << 48 | seed).to_string()).collect();
+    for (name, starts) in [("--layouts", layouts), ("--seeds", seeds)] {
+        let mut arguments = vec!["--side", "16", "--actions", &file, name];
+        arguments.extend(starts.iter().map(String::as_str));
+        assert!(assert_equal_traces(&arguments) >= 7 * 24 * 4);
+    }
+}
+
+/// A file of actions far from what the expert would do.
+fn wild_actions(folder: &Path, count: usize) -> String {
+    let file = folder.join("actions.txt");
     let mut actions = String::new();
     let mut state = 1u32;
     let mut uniform = || {
         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         f64::from(state) / f64::from(u32::MAX) - 0.5
     };
-    for _ in 0..120 {
+    for _ in 0..count {
         for scale in [0.06, 0.06, 0.06, 0.3, 0.3, 0.6, 2.0] {
             write!(actions, "{} ", scale * uniform()).expect("a text takes more");
         }
         actions.push('\n');
     }
     std::fs::write(&file, actions).expect("written");
-    let file = file.to_str().expect("a readable path");
-    for task in TASKS {
-        assert_equal_traces(&["--task", task, "--layout", "7", "--side", "224", "--actions", file]);
+    file.to_str().expect("a readable path").to_owned()
+}
+
+/// What is written into tasks.toml in place of what, and the words of the errors of both programs.
+const WRONG_TASKS: [(&str, &str, &str); 5] = [
+    ("[tasks.widowx_spoon_on_towel.variants.paraphrase]", "hight = 1", "hight"),
+    ("[tasks.widowx_spoon_on_towel.variants.paraphrase]", "random.speed = 1", "speed"),
+    ("[tasks.widowx_spoon_on_towel.variants.paraphrase]", "mjcf.geom.a.size = 1", "size"),
+    ("separation_min = 0.13\nlayouts = [", "  [0.0, 0.0, 0.0],", "24"),
+    ("[world]", "gravity = 9.81", "gravity"),
+];
+
+#[test]
+fn both_name_the_key_that_is_wrong_in_the_description_of_the_tasks() {
+    let ServerProgram::Native { program, assets } = native() else { unreachable!("it is native") };
+    let whole = std::fs::read_to_string(assets.join("tasks.toml")).expect("it can be read");
+    let folder = tempfile::tempdir().expect("a folder");
+    for (after, added, named) in WRONG_TASKS {
+        let changed = whole.replacen(after, &format!("{after}\n{added}"), 1);
+        assert_ne!(changed, whole);
+        std::fs::write(folder.path().join("tasks.toml"), changed).expect("written");
+        let mut natively = Command::new(program);
+        natively.arg("--assets").arg(folder.path()).args(["trace", "--tasks", "all"]);
+        let mut in_python = python().command();
+        let load = "import sys, pathlib, rever_env.tasks as t; t.load(pathlib.Path(sys.argv[1]))";
+        in_python.args(["-c", load]).arg(folder.path());
+        for command in [&mut natively, &mut in_python] {
+            let output = run(command);
+            let said = text(&output);
+            assert!(!output.status.success(), "{added}: {said}");
+            assert!(said.contains("tasks.toml") && said.contains(named), "{added}: {said}");
+        }
     }
 }
 

@@ -48,7 +48,9 @@ class Row:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--model", type=Path, required=True)
-    parser.add_argument("--tasks", nargs="+", default=list(tasks.load()))
+    parser.add_argument(
+        "--tasks", nargs="+", default=[task.name for task in tasks.choose(tasks.load(), None)]
+    )
     parser.add_argument("--layouts", choices=["grid", "random"], default="grid")
     parser.add_argument("--episodes", type=int, default=GRID, help="of each task")
     parser.add_argument("--temperature", type=float, default=0.0)

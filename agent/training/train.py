@@ -75,10 +75,10 @@ def main() -> None:
     torch.manual_seed(options.seed)
     training, held_out = demonstration.split(demonstration.find(options.demonstrations))
     episodes = dataset.read(training)
-    every_task = tasks.load()
+    every_task = tasks.choose(tasks.load(), None)
     tokenizer = Tokenizer.build(
-        reasoning.phrases(every_task.values()),
-        [task.instruction.lower() for task in every_task.values()],
+        reasoning.phrases(every_task),
+        [task.instruction.lower() for task in every_task],
     )
     statistics = dataset.measure(episodes)
     frames = dataset.tabulate(episodes, tokenizer, statistics)

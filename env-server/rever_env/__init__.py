@@ -1,11 +1,25 @@
-"""The world of the four Bridge tasks.
+"""Robot environments for Gymnasium: four Bridge tasks on MuJoCo, and environments behind servers.
 
+    import gymnasium
+
+    environment = gymnasium.make("rever_env:rever/StackCube-v1")
+    observation, info = environment.reset(seed=1)  # image, state, instruction
+    action = environment.action_space.sample()  # metres, radians, gripper
+    observation, reward, terminated, truncated, info = environment.step(action)
+
+Ids: rever/SpoonOnTowel-v1, rever/CarrotOnPlate-v1, rever/StackCube-v1, rever/EggplantInBasket-v1
+(BridgeEnv), and rever/Remote-v1 with connect="tcp/HOST:PORT" for a server that was started with
+`python -m rever_env serve --listen tcp/HOST:PORT` (RemoteEnv; RemoteVectorEnv for many at once).
+
+Modules, in the order of the data:
 tasks.toml -> tasks -> layout -> world (controller, success, camera, snapshot)
 world -> expert -> reasoning -> demonstrations; world -> gymnasium_env
 world, robosuite_world, gymnasium_world -> worlds -> session -> server
-server -> remote_session -> remote: the same as Gymnasium environments, in another process
+server -> remote_network -> remote_session -> remote -> remote_vector
+gymnasium_env, remote -> lerobot
 """
 
+import importlib
 import os
 import sys
 from typing import TYPE_CHECKING
@@ -13,9 +27,28 @@ from typing import TYPE_CHECKING
 from rever_env import registration
 
 if TYPE_CHECKING:
-    from rever_env.remote import RemoteEnv, RemoteVectorEnv
+    from rever_env.gymnasium_env import BridgeEnv
+    from rever_env.remote import RemoteEnv
+    from rever_env.remote_network import RemoteFault, RemoteRefused
+    from rever_env.remote_vector import RemoteVectorEnv, RemoteVectorFault
 
-__all__ = ["RemoteEnv", "RemoteVectorEnv"]
+__all__ = [
+    "BridgeEnv",
+    "RemoteEnv",
+    "RemoteFault",
+    "RemoteRefused",
+    "RemoteVectorEnv",
+    "RemoteVectorFault",
+]
+# Loaded when asked for: a server needs no client, and a client no simulator.
+_MODULES = {
+    "BridgeEnv": "gymnasium_env",
+    "RemoteEnv": "remote",
+    "RemoteFault": "remote_network",
+    "RemoteRefused": "remote_network",
+    "RemoteVectorEnv": "remote_vector",
+    "RemoteVectorFault": "remote_vector",
+}
 
 # Importing MuJoCo with its default backend needs a display. The worlds make their own contexts.
 _HAS_DISPLAY = bool(os.environ.get("DISPLAY"))
@@ -30,9 +63,10 @@ registration.register()
 
 
 def __getattr__(name: str) -> object:
-    # Loaded when asked for: a server needs no client.
-    if name in __all__:
-        from rever_env import remote
-
-        return getattr(remote, name)
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"rever_env.{_MODULES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rever_env import mjcf
 from rever_env.tasks import Task
 from rever_env.world import World
 
@@ -99,9 +100,9 @@ def measure(tasks: list[Task], side: int, steps: int, other: Block | None = None
                     for times, more in zip((ours, bare, others), seconds, strict=True):
                         times.extend(more[1:])
             blocks.close()
-        rows += [_row(task.name, ours), _row(f"{task.name}, bare", bare)]
+        rows += [_row(str(task.id), ours), _row(f"{task.id}, bare", bare)]
         if other:
-            rows.append(_row(f"{task.name}, {_ROBOSUITE}", others))
+            rows.append(_row(f"{task.id}, {_ROBOSUITE}", others))
     return rows
 
 
@@ -113,7 +114,7 @@ class _Blocks:
         self._substeps = world.task.settings.substeps
         self._camera = world.task.settings.camera
         # A model of its own: the camera hides shapes of the world's.
-        self._model = mujoco.MjModel.from_xml_path(str(world.task.scene))
+        self._model = mjcf.compile(world.task)
         self._spare = mujoco.MjData(self._model)
         self._renderer = mujoco.Renderer(self._model, side, side)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):

@@ -17,7 +17,7 @@ from rever_env.expert import Decision
 from rever_env.tasks import Task
 from rever_env.world import Observation, World
 
-SETTLE_STEPS = 6  # kept after released success, so that letting go and staying are learnt
+SETTLE_STEPS = 6  # steps recorded after the object was released on its target
 _NOISE_POSITION = 0.005  # metres, stationary standard deviation
 _NOISE_YAW = 0.04  # rad
 _NOISE_REVERSION = 0.3  # per step
@@ -69,7 +69,7 @@ class Noise:
 
 @dataclass
 class Annotator:
-    """Writes the reasoning of a step; remembers boxes for objects that are hidden for a while."""
+    """Writes the reasoning of a step; keeps the last boxes of objects that are hidden."""
 
     world: World
     boxes: list[reasoning.Box | None]
@@ -128,6 +128,7 @@ def record(world: World, seed: int, noisy: bool) -> dict[str, Any] | None:
         "reasoning": np.array(texts),
         "instruction": np.array(world.task.instruction),
         "task": np.array(world.task.name),
+        "variant": np.array(world.task.variant),
         "seed": np.array(seed, dtype=np.int64),
         "success": np.array(True),
     }
@@ -135,7 +136,7 @@ def record(world: World, seed: int, noisy: bool) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Share:
-    """What one process records: every stride-th of the episodes, from an offset on."""
+    """The episodes of one process: every stride-th, starting at an offset."""
 
     tasks: tuple[Task, ...]
     episodes: int
@@ -146,25 +147,31 @@ class Share:
     stride: int
 
 
+def folder(out: Path, task: Task) -> Path:
+    """The folder of a task's episodes: TASK, or TASK@VARIANT for another than the default one."""
+    return out / str(task.id).replace("/", "@")
+
+
 def record_share(share: Share) -> dict[str, tuple[int, int]]:
-    """Records what is missing; returns kept and failed episodes per task.
+    """Records missing episodes; returns kept and failed episodes per task.
 
     A failed episode leaves an empty .failed file, so that a resumed run does not repeat it.
     """
-    counts = {task.name: [0, 0] for task in share.tasks}
+    counts = {str(task.id): [0, 0] for task in share.tasks}
     worlds = [World(task) for task in share.tasks]
     try:
-        # Tasks take turns, so that an interrupted run is balanced.
+        # Tasks alternate, so that an interrupted run has as many episodes of each.
         for index in range(share.offset, share.episodes, share.stride):
             for world in worlds:
                 seed = share.seed + index
-                path = share.out / world.task.name / f"{seed}.npz"
+                name = str(world.task.id)
+                path = folder(share.out, world.task) / f"{seed}.npz"
                 failure = path.with_suffix(".failed")
                 if path.exists() or failure.exists():
-                    counts[world.task.name][0 if path.exists() else 1] += 1
+                    counts[name][0 if path.exists() else 1] += 1
                     continue
                 episode = record(world, seed, share.noisy)
-                counts[world.task.name][0 if episode is not None else 1] += 1
+                counts[name][0 if episode is not None else 1] += 1
                 if episode is None:
                     failure.touch()
                     continue
@@ -188,9 +195,9 @@ def demonstrate(
     processes: int,
     report: Callable[[str], None],
 ) -> dict[str, tuple[int, int]]:
-    """Records episodes per task from seeds seed.. on; existing files are kept as they are."""
+    """Records episodes of every task with seeds from seed on; existing files are kept."""
     for task in tasks:
-        (out / task.name).mkdir(parents=True, exist_ok=True)
+        folder(out, task).mkdir(parents=True, exist_ok=True)
     shares = [
         Share(tuple(tasks), episodes, seed, out, noisy, offset, processes)
         for offset in range(processes)
@@ -199,7 +206,7 @@ def demonstrate(
     total = episodes * len(tasks)
     seeds = range(seed, seed + episodes)
     before = _recorded(tasks, seeds, out)
-    # Fresh processes: an OpenGL context does not survive a fork.
+    # Not forked: other libraries' threads do not survive a fork.
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(record_share, share) for share in shares]
         while not all(future.done() for future in futures):
@@ -210,18 +217,18 @@ def demonstrate(
             report(f"{done} of {total} episodes, {seconds:.0f} s, about {left:.0f} s left")
         results = [future.result() for future in futures]
     return {
-        task.name: (
-            sum(result[task.name][0] for result in results),
-            sum(result[task.name][1] for result in results),
+        str(task.id): (
+            sum(result[str(task.id)][0] for result in results),
+            sum(result[str(task.id)][1] for result in results),
         )
         for task in tasks
     }
 
 
 def _recorded(tasks: list[Task], seeds: range, out: Path) -> int:
-    """How many of the episodes are there; the directory may hold those of other seeds as well."""
+    """How many of the episodes are recorded; the folder may contain other seeds."""
     return sum(
-        entry.suffix in (".npz", ".failed") and int(entry.stem) in seeds
+        entry.suffix in (".npz", ".failed") and entry.stem.isdecimal() and int(entry.stem) in seeds
         for task in tasks
-        for entry in (out / task.name).iterdir()
+        for entry in folder(out, task).iterdir()
     )

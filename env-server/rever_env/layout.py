@@ -1,10 +1,10 @@
 """Initial layouts: the 24 of the published grid, and random ones that stay clear of them."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rever_env.fault import InvalidReset
-from rever_env.tasks import Layout, Task
+from rever_env.tasks import Layout, Pose, Task
 
 _MASK = (1 << 64) - 1
 _DRAWS_MAX = 10_000
@@ -72,8 +72,34 @@ def _draw(task: Task, seed: int) -> Layout:
         )
         apart = _distance(layout.source_x - layout.target_x, layout.source_y - layout.target_y)
         if apart >= ranges.separation_min and not near_grid_layout(task, layout):
-            return layout
-    raise InvalidReset(f"task {task.name}, seed {seed}: no free layout in {_DRAWS_MAX} draws")
+            # After source and target, which are then where they are without distractors.
+            return replace(layout, distractors=_draw_distractors(task, layout, generator, seed))
+    raise InvalidReset(f"task {task.id}, seed {seed}: no free layout in {_DRAWS_MAX} draws")
+
+
+def _draw_distractors(
+    task: Task, layout: Layout, generator: SplitMix64, seed: int
+) -> tuple[Pose, ...]:
+    placed = [(layout.source_x, layout.source_y), (layout.target_x, layout.target_y)]
+    poses = []
+    for distractor in task.distractors:
+        for _ in range(_DRAWS_MAX):
+            pose = Pose(
+                generator.uniform(*distractor.x),
+                generator.uniform(*distractor.y),
+                generator.uniform(*distractor.yaw),
+            )
+            nearest = min(_distance(pose.x - x, pose.y - y) for x, y in placed)
+            if nearest >= distractor.separation_min:
+                break
+        else:
+            raise InvalidReset(
+                f"task {task.id}, seed {seed}: no free place for the {distractor.body} in "
+                f"{_DRAWS_MAX} draws"
+            )
+        placed.append((pose.x, pose.y))
+        poses.append(pose)
+    return tuple(poses)
 
 
 def _fnv1a(text: str) -> int:

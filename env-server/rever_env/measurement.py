@@ -67,7 +67,7 @@ def measure(
                 chunks.append(Chunk(task, suite, (None,) * len(seeds), seeds, in_robosuite))
     rows: dict[tuple[str, str], Row] = {}
     for chunk in chunks:
-        key = chunk.task.name, chunk.suite
+        key = str(chunk.task.id), chunk.suite
         rows.setdefault(key, Row(*key))
     started = time.monotonic()
     total = sum(len(chunk.seeds) for chunk in chunks)
@@ -85,7 +85,7 @@ def measure(
 
 def run(chunk: Chunk) -> Row:
     """The episodes of one chunk; each runs to its horizon, as SIMPLER's last-step rule asks."""
-    row = Row(chunk.task.name, chunk.suite)
+    row = Row(str(chunk.task.id), chunk.suite)
     world = _world(chunk)
     try:
         started = time.perf_counter()

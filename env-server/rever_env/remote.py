@@ -1,48 +1,69 @@
-"""Environments that run in servers elsewhere, as Gymnasium environments: one, and many at once."""
+"""Environments that run in servers elsewhere, as Gymnasium environments."""
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from gymnasium.error import ClosedEnvironmentError
+from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from rever_env import protocol
-from rever_env.remote_session import Fleet, RemoteFault, RemoteSession, holder
-from rever_env.spaces import (
-    RANDOM_SEEDS,
-    action_space,
+from rever_env.arguments import (
+    action_numbers,
     check_render_mode,
+    image_size,
     layout_of,
-    observation_space,
+    seed_of,
 )
+from rever_env.followed import CommandedPose, is_pose_controlled
+from rever_env.remote_session import (
+    Fleet,
+    RemoteFault,
+    RemoteRefused,
+    RemoteSession,
+    Wanted,
+    opened,
+)
+from rever_env.spaces import RANDOM_SEEDS, action_space, metadata_of, observation_space
+
+__all__ = ["RemoteEnv", "RemoteFault", "RemoteRefused"]
 
 Fields = dict[str, Any]
 Stepped = tuple[Fields, float, bool, bool, Fields]
 
 
-class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
+class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
     """One session of a server that speaks protocol/README.md, whatever simulator it is.
 
-    connect: endpoints of servers or a router, as tcp/HOST:PORT, or one of them.
-    task: by default the first that the server offers. variant: "default" of a named task.
-    observation: image uint8 (height, width, 3), state float32 (n,), instruction text.
-    action: float32 (n,), or a whole number where the task has a choice of actions. What the numbers
-    are, session.task.state and session.task.action say; of a Bridge task see BridgeEnv. Without
-    images (0 x 0 pixels, or a server that has none) or numbers that part of the observation is left
-    out.
-    reset options: {"layout": 0..} for a fixed layout; otherwise the seed draws one.
-    expert: info has "expert_action", float32 (n,), what the server's scripted expert would do.
-    wait_secs: for a server to be there; reply_secs: for a reply, whatever is sent again meanwhile.
-    Raises RemoteFault when the world or the way to it breaks, which is never a reward, and
-    RemoteRefused when the server refuses a request.
+    Arguments
+        connect: endpoints of servers or of a router, as tcp/HOST:PORT or HOST:PORT, or one of them.
+        task: TASK or TASK/VARIANT; by default the first that the server offers. variant: instead
+        of /VARIANT.
+        image_height, image_width: pixels, 1 to 1024; 0 and 0 for no image.
+        fleet: namespace of the servers. server: id of one of them; by default the least used.
+        expert: info has "expert_action", float32, what the server's scripted expert would do.
+        wait_secs: for a server with a free session (default: 2 s for a server to be found, 30 s for
+        a session to be free). reply_secs: for a reply, while the server is paused, too.
+
+    Observation: image uint8 (height, width, 3), state float32 (n,), instruction text. Without
+    images (0 x 0 pixels, or a server that has none) or numbers that part is left out.
+    Action: float32 (n,), or a whole number where the task has a choice of actions. What the numbers
+    are, session.task.state and session.task.action say; of a Bridge task see BridgeEnv.
+    Reward, end of episodes and info: as the served environment has them. metadata["render_fps"] is
+    its control rate. info has the flags of BridgeEnv; of other environments only is_success and
+    ever_success are known.
+
+    RemoteFault is raised when the environment or the way to it breaks, which is never a reward: the
+    next reset begins a new episode, over a new session if need be, and finds a server that was
+    started again. RemoteRefused is raised when the server refuses a request, ValueError for invalid
+    arguments, gymnasium.error.ClosedEnvironmentError after close.
+    Use it in one thread at a time, and in the process that made it: zenoh does not survive a fork.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's form)
 
     def __init__(
         self,
@@ -56,69 +77,83 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         server: str | None = None,
         expert: bool = False,
         render_mode: str | None = "rgb_array",
-        wait_secs: float = 30.0,
+        wait_secs: float | None = None,
         reply_secs: float = 120.0,
     ) -> None:
+        EzPickle.__init__(
+            self,
+            connect,
+            task,
+            variant,
+            image_height,
+            image_width,
+            fleet=fleet,
+            server=server,
+            expert=expert,
+            render_mode=render_mode,
+            wait_secs=wait_secs,
+            reply_secs=reply_secs,
+        )
+        self._is_closed = True
         check_render_mode(render_mode)
-        self.render_mode = render_mode
+        height, width = image_size(image_height, image_width)
         endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-
-        def opening(description: protocol.Description) -> protocol.Open:
-            side_max = description.image_side_max  # 0: it has no images
-            first = description.tasks[0]
-            return protocol.Open(
-                protocol.PROTOCOL_VERSION,
-                first.task if task is None else task,
-                (first.variant if task is None else "default") if variant is None else variant,
-                image_height if side_max else 0,
-                image_width if side_max else 0,
-                expert,
-                holder(),
-            )
-
-        self.session = RemoteSession(
-            Fleet(endpoints, fleet, server, wait_secs, reply_secs), opening
-        )
-        self._last: protocol.Observation | None = None
+        self._fleet = Fleet(endpoints, fleet, server, wait_secs, reply_secs)
+        self.session = opened(self._fleet, Wanted(task, variant, height, width, expert))
         self._is_closed = False
+        told, sizes = self.session.task, self.session.opened
+        self._wanted = Wanted(told.task, told.variant, height, width, expert)
+        self._last: protocol.Observation | None = None
+        self.metadata = metadata_of(told.control_hz)
         self.observation_space = observation_space(
-            self.session.opened.image_height,
-            self.session.opened.image_width,
-            self.session.task.instruction,
-            self.session.task.state,
+            sizes.image_height, sizes.image_width, told.state
         )
+        self.action_space: spaces.Space[Any] = action_space(told.action)
         self._names = set(self.observation_space.spaces)
-        if "image" not in self._names:
-            self.render_mode = None
-        self.action_space: spaces.Space[Any] = action_space(self.session.task.action)
+        self.render_mode = render_mode if "image" in self._names else None
+        self._commanded: CommandedPose | None = None
 
     def reset(
         self, *, seed: int | None = None, options: Fields | None = None
     ) -> tuple[Fields, Fields]:
+        """Begins an episode; the same seed and options give the same one.
+
+        seed: 0 to 2^53 - 1; None draws one. options: {"layout": 0..} for a fixed initial layout;
+        otherwise the seed draws it. info: seed, and expert_action if it was asked for.
+        """
         self.send_reset(seed, options)
         return self.receive_reset()
 
     def step(self, action: NDArray[np.float32]) -> Stepped:
+        """One control step: observation, reward, terminated, truncated, info."""
         self.send_step(action)
         return self.receive_step()
 
     def render(self) -> NDArray[np.uint8] | None:
+        """A copy of the last observation's image; None before the first reset."""
         if self.render_mode is None or self._last is None:
             return None
         return _image(self._last)
 
     def close(self) -> None:
+        """Ends the session; a second call does nothing."""
         if not self._is_closed:
-            self.session.close()
             self._is_closed = True
+            self.session.close()
 
     def send_reset(self, seed: int | None, options: Fields | None = None) -> None:
         """The first half of reset: returns before the server has answered."""
+        self._require_open()
+        layout, seed = layout_of(options), seed_of(seed)
         super().reset(seed=seed)  # seeds the stream that later resets draw from
-        layout, task = layout_of(options), self.session.task
         self._seed = int(self.np_random.integers(RANDOM_SEEDS)) if seed is None else seed
+        if self.session.is_lost:
+            self._open_again()
+        task, numbered_seed = self.session.task, self._seed
         self.session.send(
-            lambda sequence: protocol.Reset(sequence, task.task, task.variant, layout, self._seed)
+            lambda sequence: protocol.Reset(
+                sequence, task.task, task.variant, layout, numbered_seed
+            )
         )
 
     def receive_reset(self) -> tuple[Fields, Fields]:
@@ -126,23 +161,25 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         reply = self.session.receive()
         if not isinstance(reply, protocol.Observed):
             raise RemoteFault(f"expected Observed, got {type(reply).__name__}")
-        return self._fields(reply.observation), {"seed": self._seed, **self._hints()}
+        observation = self._fields(reply.observation)
+        told = self.session.task
+        self._commanded = (
+            CommandedPose(observation["state"])
+            if is_pose_controlled(told.state, told.action)
+            else None
+        )
+        return observation, {"seed": self._seed, **self._hints()}
 
     def send_step(self, action: NDArray[np.float32]) -> None:
         """The first half of step."""
-        numbers = self.checked(action)
+        self._require_open()
+        self._action = self.checked(action)
+        numbers = tuple(self._action.reshape(-1).tolist())
         self.session.send(lambda sequence: protocol.Step(sequence, numbers))
 
-    def checked(self, action: NDArray[np.float32]) -> tuple[float, ...]:
+    def checked(self, action: Any) -> NDArray[np.float32]:
         """The action's numbers; ValueError for others than the space has."""
-        numbers = np.asarray(action, np.float32)
-        if numbers.shape != self.action_space.shape:
-            raise ValueError(
-                f"action: expected shape {self.action_space.shape}, got {numbers.shape}"
-            )
-        if not np.isfinite(numbers).all():
-            raise ValueError(f"action: expected finite numbers, got {numbers.tolist()}")
-        return tuple(numbers.reshape(-1).tolist())
+        return action_numbers(self.action_space, action)
 
     def receive_step(self) -> Stepped:
         """The second half."""
@@ -152,7 +189,26 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         transition = reply.transition
         observation = self._fields(transition.observation)
         info = {**asdict(transition.statistics), **self._hints()}
+        if self._commanded is not None:
+            info["action_followed"] = self._commanded.follow(self._action, observation["state"])
         return observation, transition.reward, transition.terminated, transition.truncated, info
+
+    def _open_again(self) -> None:
+        """Opens a session in place of the lost one, on whatever server is there now."""
+        before = self.session
+        before.close()
+        self.session = RemoteSession(self._fleet, self._wanted, is_return=True)
+        told, expected = self.session.task, before.task
+        if replace(told, instruction=expected.instruction) != expected:
+            self.session.close()
+            raise RemoteFault(
+                f"server {self.session.server}: expected task {expected.task} "
+                f"({expected.variant}) as server {before.server} had described it, got another"
+            )
+
+    def _require_open(self) -> None:
+        if self._is_closed:
+            raise ClosedEnvironmentError("expected an open environment: close() was called")
 
     def _fields(self, observation: protocol.Observation) -> Fields:
         self._last = observation
@@ -169,127 +225,8 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]]):
         return {"expert_action": np.array(self._last.expert_action, np.float32)}
 
 
-class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
-    """Sessions of many servers, stepped at once: every request is out before any reply is read.
-
-    connect: endpoints, each of a server or a router; environments are dealt out to them in turns,
-    by default one to each. Other arguments as for RemoteEnv.
-    autoreset_mode: as in gymnasium.vector. NEXT_STEP: the step after an episode's end begins the
-    next one and ignores its action. SAME_STEP: the last step itself does, and the last observation
-    is in info["final_obs"]. DISABLED: reset with options={"reset_mask": bool (environments,)}.
-    """
-
-    def __init__(
-        self,
-        connect: str | Sequence[str],
-        num_envs: int | None = None,
-        *,
-        autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
-        **arguments: Any,
-    ) -> None:
-        endpoints = [connect] if isinstance(connect, str) else list(connect)
-        self.num_envs = len(endpoints) if num_envs is None else num_envs
-        if not endpoints or self.num_envs < 1:
-            raise ValueError(
-                f"expected endpoints and environments, got {len(endpoints)} and {self.num_envs}"
-            )
-        self.envs: list[RemoteEnv] = []
-        try:
-            for index in range(self.num_envs):
-                self.envs.append(RemoteEnv(endpoints[index % len(endpoints)], **arguments))
-        except BaseException:
-            self.close_extras()
-            raise
-        first = self.envs[0]
-        self.render_mode = first.render_mode
-        self.autoreset_mode = autoreset_mode
-        self.metadata = {**RemoteEnv.metadata, "autoreset_mode": autoreset_mode}
-        self.single_observation_space = first.observation_space
-        self.single_action_space = first.action_space
-        self.observation_space = batch_space(first.observation_space, self.num_envs)
-        self.action_space = batch_space(first.action_space, self.num_envs)
-        self._ended = np.zeros(self.num_envs, np.bool_)
-        self._latest: list[Fields] = [{}] * self.num_envs
-
-    def reset(self, *, seed: Any = None, options: Fields | None = None) -> tuple[Fields, Fields]:
-        """seed: the first of consecutive ones, or a list with one or None for each environment."""
-        options = dict(options or {})
-        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, np.bool_)))
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
-            raise ValueError(f"reset_mask: expected bool ({self.num_envs},), got {mask.shape}")
-        if seed is None or isinstance(seed, int):
-            seeds = [None if seed is None else seed + index for index in range(self.num_envs)]
-        else:
-            seeds = list(seed)
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seed: expected {self.num_envs} seeds, got {len(seeds)}")
-        for env, own, wanted in zip(self.envs, seeds, mask, strict=True):
-            if wanted:
-                env.send_reset(own, options)
-        infos: Fields = {}
-        for index, env in enumerate(self.envs):
-            if mask[index]:
-                self._latest[index], info = env.receive_reset()
-                infos = self._add_info(infos, info, index)
-        self._ended[mask] = False
-        return self._batch(), infos
-
-    def step(
-        self, actions: NDArray[np.float32]
-    ) -> tuple[Fields, NDArray[Any], NDArray[Any], NDArray[Any], Fields]:
-        """actions: one for each environment."""
-        if len(actions) != self.num_envs:
-            raise ValueError(f"actions: expected {self.num_envs} of them, got {len(actions)}")
-        if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
-            ended = np.flatnonzero(self._ended).tolist()
-            raise ValueError(f"environments {ended} have ended: expected reset with a reset_mask")
-        begins = self._ended.copy()
-        for env, action, begin in zip(self.envs, actions, begins, strict=True):
-            if not begin:
-                env.checked(action)  # before any of them moves
-        for env, action, begin in zip(self.envs, actions, begins, strict=True):
-            if begin:
-                env.send_reset(None)
-            else:
-                env.send_step(action)
-        rewards = np.zeros(self.num_envs, np.float64)
-        terminated, truncated = (np.zeros(self.num_envs, np.bool_) for _ in range(2))
-        infos: Fields = {}
-        for index, env in enumerate(self.envs):
-            if begins[index]:
-                self._latest[index], info = env.receive_reset()
-            else:
-                stepped = env.receive_step()
-                self._latest[index], rewards[index] = stepped[0], stepped[1]
-                terminated[index], truncated[index], info = stepped[2], stepped[3], stepped[4]
-            infos = self._add_info(infos, info, index)
-        self._ended = terminated | truncated
-        if self.autoreset_mode == AutoresetMode.SAME_STEP:
-            infos = self._begin_ended(infos)
-        return self._batch(), rewards, terminated, truncated, infos
-
-    def close_extras(self, **_arguments: Any) -> None:
-        for env in self.envs:
-            env.close()
-
-    def _begin_ended(self, infos: Fields) -> Fields:
-        ended = np.flatnonzero(self._ended).tolist()
-        for index in ended:
-            infos = self._add_info(infos, {"final_obs": self._latest[index]}, index)
-            self.envs[index].send_reset(None)
-        for index in ended:
-            self._latest[index], info = self.envs[index].receive_reset()
-            infos = self._add_info(infos, info, index)
-        self._ended[:] = False
-        return infos
-
-    def _batch(self) -> Fields:
-        empty: Any = create_empty_array(self.single_observation_space, self.num_envs)
-        batched: Any = concatenate(self.single_observation_space, self._latest, empty)
-        fields: Fields = batched
-        return fields
-
-
 def _image(observation: protocol.Observation) -> NDArray[np.uint8]:
+    """Writable, and nobody else's."""
     image = observation.image
-    return np.frombuffer(image.pixels, np.uint8).reshape(image.height, image.width, 3)
+    pixels: NDArray[np.uint8] = np.array(np.frombuffer(image.pixels, np.uint8))
+    return pixels.reshape(image.height, image.width, 3)

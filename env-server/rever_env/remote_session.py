@@ -1,4 +1,4 @@
-"""The agent's end of the protocol in Python: one leased session, and what can go wrong."""
+"""The agent's end of the protocol in Python: one session, and what can go wrong."""
 
 import contextlib
 import dataclasses
@@ -6,7 +6,6 @@ import os
 import queue
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import zenoh
@@ -14,64 +13,50 @@ import zenoh
 from rever_env import protocol
 from rever_env.protocol import tiles
 from rever_env.protocol.codec import M
-from rever_env.serving import Endpoints
+from rever_env.remote_network import (
+    Fleet,
+    ForkedProcess,
+    Network,
+    RemoteFault,
+    RemoteRefused,
+    Wanted,
+    require_own_process,
+)
 
-_LOOK_SECS = 0.2  # between looks at who is there
+__all__ = ["Fleet", "RemoteFault", "RemoteRefused", "RemoteSession", "Wanted", "opened"]
+
 _RESEND_SECS = 0.5  # then twice as long, and so on
 _RESEND_SECS_MAX = 4.0
-_OPEN_SECS = 60.0  # a server may have to make a world first
-
-
-class RemoteFault(RuntimeError):
-    """The world or the way to it broke: the episode has no outcome.
-
-    The next reset may work. Where the session itself is gone, with its server or for its long
-    silence, it will not, and the environment has to be made again.
-    """
-
-
-class RemoteRefused(ValueError):
-    """The server refused a request; its world is unchanged."""
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """Which servers. connect: endpoints of servers or of a router, as tcp/HOST:PORT.
-
-    server: its id; without one, the server with most free sessions.
-    """
-
-    connect: tuple[str, ...]
-    fleet: str = "local"
-    server: str | None = None
-    wait_secs: float = 30.0  # for a server to be there
-    reply_secs: float = 120.0  # for a reply, whatever is sent again meanwhile
+_LOOK_SECS = 0.1  # between looks for a server whose token is gone
+_OPEN_SECS = 60.0  # a server may have to make an environment first
+_CLOSE_SECS = 2.0  # the session ends with its holder's token, too
+# From a restored connection to a reply: a server ends a session whose holder it has lost.
+_RESTORED_SECS = 15.0
 
 
 class RemoteSession:
-    """Requests are numbered and sent again until a reply comes; close() ends the session."""
+    """Requests are numbered and sent again until a reply comes; close() ends the session.
 
-    def __init__(self, fleet: Fleet, ask: Callable[[protocol.Description], protocol.Open]) -> None:
-        """ask: turns the server's description into what is opened."""
-        self._fleet = fleet
+    server: its id. task: what it says of the task. opened: what was asked for.
+    is_lost: no request will be answered any more; a new session is needed.
+    """
+
+    def __init__(self, fleet: Fleet, wanted: Wanted, *, is_return: bool = False) -> None:
+        """is_return: the session takes the place of one that is lost."""
+        self._reply_secs = fleet.reply_secs
         self._keys = protocol.Keys(fleet.fleet)
-        endpoints = Endpoints(fleet.connect, (), multicast=False, wait_secs=fleet.wait_secs)
-        try:
-            self._network = zenoh.open(zenoh.Config.from_json5(endpoints.configuration()))
-        except zenoh.ZError as error:
-            raise RemoteFault(f"cannot reach {fleet.connect}: {error}") from None
-        self._replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._replies: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()  # None: wake up
         self._sequence = 0
         self._request = b""
         self._is_unanswered = False
         self._last_image = protocol.Image(0, 0, b"")  # what a step's tiles are laid on
-        self._asked_at = 0.0
-        self._end = ""  # why the server ended the session
-        self._declared: list[Any] = []
+        self._asked_at = self._answered_at = time.monotonic()
+        self.is_lost = False
+        self._network = Network(fleet, is_return=is_return)
         try:
-            self._open(ask)
+            self._open(fleet, wanted)
         except BaseException:
-            self._network.close()  # type: ignore[no-untyped-call]
+            self._network.close()
             raise
 
     def ask(self, make: Callable[[int], protocol.Request]) -> protocol.Reply:
@@ -81,15 +66,17 @@ class RemoteSession:
 
     def send(self, make: Callable[[int], protocol.Request]) -> None:
         """Sends the next request; make: its number to the request."""
-        if self._end:
-            raise RemoteRefused(self._end)  # nobody would answer
+        require_own_process()
+        if self.is_lost:
+            raise RemoteFault(f"{self._server}: the session is lost, and reset opens a new one")
         request = make(self._sequence + 1)
-        # What the lost reply brought is missing: a reward, and the picture that tiles are laid on.
+        # What the lost reply brought is missing: a reward, and the image that tiles are laid on.
         if self._is_unanswered and not isinstance(request, protocol.Reset | protocol.Close):
             raise RemoteFault(
-                f"server {self.server}: expected Reset after a request whose reply was not taken, "
+                f"{self._server}: expected Reset after a request whose reply was not taken, "
                 f"got {type(request).__name__}"
             )
+        self._refuse_early_replies()
         self._request = protocol.REQUEST.encode(request)
         self._sequence += 1
         self._is_unanswered = True
@@ -98,36 +85,63 @@ class RemoteSession:
 
     def receive(self) -> protocol.Reply:
         """The reply to the last request; RemoteRefused or RemoteFault if it is none."""
-        wait = _RESEND_SECS
-        while True:
-            reply = self._reply_within(wait)
-            if reply is not None:
-                break
-            waited = time.monotonic() - self._asked_at
-            if waited > self._fleet.reply_secs or not self._is_alive():
-                raise RemoteFault(f"server {self.server}: no reply within {waited:.0f} s")
-            self._publisher.put(self._request)
-            wait = min(2.0 * wait, _RESEND_SECS_MAX)
+        reply = self._awaited()
+        self._answered_at = time.monotonic()
         if isinstance(reply, protocol.Refused):
             self._is_unanswered = False
             if reply.sequence == 0:  # every request of ours can be read: it is the session's end
-                self._end = reply.reason
+                raise self._lost(f"refused: {reply.reason}")
             raise RemoteRefused(reply.reason)
         if isinstance(reply, protocol.Faulted):
             self._is_unanswered = False
-            raise RemoteFault(f"server {self.server}: {reply.kind.value}: {reply.reason}")
+            raise RemoteFault(f"{self._server}: {reply.kind.value}: {reply.reason}")
         whole = self._whole(reply)
         self._is_unanswered = False
         return whole
 
     def close(self) -> None:
-        """Ends the session; a server that is gone has ended it already."""
-        with contextlib.suppress(RemoteFault, RemoteRefused, zenoh.ZError):
-            if self._is_alive():
+        """Ends the session. In a forked process it is the parent's, and stays."""
+        if not self._network.is_own:
+            return
+        if not self.is_lost:
+            self._reply_secs = min(self._reply_secs, _CLOSE_SECS)
+            with contextlib.suppress(RemoteFault, RemoteRefused, zenoh.ZError):
                 self.ask(protocol.Close)
-        for declared in reversed(self._declared):
-            declared.undeclare()
-        self._network.close()  # type: ignore[no-untyped-call]
+        self.is_lost = True
+        self._network.close()
+
+    @property
+    def _server(self) -> str:
+        return f"server {self.server} at {self._network.place}"
+
+    def _lost(self, reason: str) -> RemoteFault:
+        self.is_lost = True
+        return RemoteFault(f"{self._server} {reason}")
+
+    def _awaited(self) -> protocol.Reply:
+        """Sends the request again until its reply comes, the server is gone or time is up."""
+        wait, deadline = _RESEND_SECS, self._asked_at + self._reply_secs
+        while True:
+            reply = self._reply_within(min(wait, max(deadline - time.monotonic(), 0.0)))
+            if reply is not None:
+                return reply
+            loss = self._network.loss()
+            if loss:
+                raise self._lost(loss)
+            now = time.monotonic()
+            if now >= deadline:
+                raise self._lost(f"did not answer for {self._reply_secs:g} s")
+            restored_at = self._network.restored_at
+            if (
+                restored_at > self._answered_at
+                and now > max(restored_at, self._asked_at) + _RESTORED_SECS
+            ):
+                raise self._lost("is back, but the session was lost with the connection")
+            if self._network.is_absent:
+                wait = _LOOK_SECS
+            else:
+                self._publisher.put(self._request)
+                wait = min(2.0 * max(wait, _RESEND_SECS), _RESEND_SECS_MAX)
 
     def _whole(self, reply: protocol.Reply) -> protocol.Reply:
         """The reply with its whole image, which a step may bring in parts."""
@@ -138,7 +152,7 @@ class RemoteSession:
                 try:
                     image = tiles.complete(observation.image, reply.changed_tiles, self._last_image)
                 except ValueError as error:
-                    raise RemoteFault(f"server {self.server}: {error}") from None
+                    raise RemoteFault(f"{self._server}: {error}") from None
                 observation = dataclasses.replace(observation, image=image)
                 transition = dataclasses.replace(transition, observation=observation)
                 reply = dataclasses.replace(reply, transition=transition, changed_tiles=None)
@@ -147,98 +161,124 @@ class RemoteSession:
             self._last_image = reply.observation.image
         return reply
 
-    def _open(self, ask: Callable[[protocol.Description], protocol.Open]) -> None:
-        description = self._find()
+    def _describe(self, description: protocol.Description, wanted: Wanted) -> None:
         self.server = description.server
         self.description = description
-        opened = self.opened = ask(description)
-        wanted = [
-            task
-            for task in description.tasks
-            if (task.task, task.variant) == (opened.task, opened.variant)
-        ]
-        if not wanted:
-            offered = ", ".join(f"{task.task} ({task.variant})" for task in description.tasks)
-            raise RemoteRefused(
-                f"expected one of the tasks {offered}, got {opened.task} ({opened.variant})"
-            )
-        self.task = wanted[0]
-        payload = protocol.OPEN.encode(opened)
+        task = wanted.among(description.tasks)
+        assert task is not None, "the server was chosen for it"
+        self.task = task
+        has_images = description.image_side_max > 0
+        self.opened = protocol.Open(
+            protocol.PROTOCOL_VERSION,
+            task.task,
+            task.variant,
+            wanted.image_height if has_images else 0,
+            wanted.image_width if has_images else 0,
+            wanted.expert,
+            f"rever_env process {os.getpid()}",
+        )
+
+    def _open(self, fleet: Fleet, wanted: Wanted) -> None:
+        description = self._network.find(wanted)
+        self._describe(description, wanted)
+        network = self._network.zenoh
+        payload = protocol.OPEN.encode(self.opened)
         key = self._keys.open(description.server)
-        answers = list(self._network.get(key, payload=payload, timeout=_OPEN_SECS))
+        answers = list(network.get(key, payload=payload, timeout=_OPEN_SECS))
         if not answers or answers[0].ok is None:
-            raise RemoteFault(f"server {description.server} did not answer Open")
+            raise RemoteFault(f"{self._server} did not answer Open within {_OPEN_SECS:g} s")
         opening = self._read(protocol.OPENING, answers[0].ok.payload.to_bytes())
         if isinstance(opening, protocol.OpenRefused):
             raise RemoteRefused(opening.reason)
         name = opening.session
-        self._declared.append(
-            self._network.declare_subscriber(
+        self._network.watch(self.server, lambda: self._replies.put(None))
+        self._network.declare(
+            network.declare_subscriber(
                 self._keys.reply(name),
                 zenoh.handlers.Callback(self._on_reply, indirect=False),
             )
         )
-        self._publisher = self._network.declare_publisher(
-            self._keys.request(name),
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            reliability=zenoh.Reliability.RELIABLE,
-            express=True,
+        self._publisher = self._network.declare(
+            network.declare_publisher(
+                self._keys.request(name),
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                reliability=zenoh.Reliability.RELIABLE,
+                express=True,
+            )
         )
-        self._declared.append(self._publisher)
-        self._declared.append(self._network.liveliness().declare_token(self._keys.session(name)))
-
-    def _find(self) -> protocol.Description:
-        """The named server, or the one with most free sessions."""
-        fleet = self._fleet
-        key = self._keys.describe(fleet.server) if fleet.server else self._keys.describe_all()
-        strange = ""
-        deadline = time.monotonic() + fleet.wait_secs
-        while True:
-            found = []
-            for reply in self._network.get(key, timeout=fleet.wait_secs):
-                if reply.ok is not None:
-                    try:
-                        found.append(protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes()))
-                    except protocol.CodecError as error:  # of another version, for instance
-                        strange = f"; one cannot be understood: {error}"
-            free = [server for server in found if server.sessions < server.sessions_max]
-            if free:
-                return max(free, key=lambda server: server.sessions_max - server.sessions)
-            if time.monotonic() > deadline:
-                what = "none has a free session" if found else "none was to be seen"
-                raise RemoteFault(
-                    f"servers of fleet {fleet.fleet} at {', '.join(fleet.connect)}: {what} "
-                    f"within {fleet.wait_secs:g} s{strange}"
-                )
-            time.sleep(_LOOK_SECS)
-
-    def _is_alive(self) -> bool:
-        tokens = self._network.liveliness().get(self._keys.server(self.server), timeout=2.0)
-        return any(reply.ok is not None for reply in tokens)
+        self._network.declare(network.liveliness().declare_token(self._keys.session(name)))
+        _last_found[:] = [(fleet, description)]
 
     def _on_reply(self, sample: Any) -> None:
         self._replies.put(sample.payload.to_bytes())
 
     def _reply_within(self, wait: float) -> protocol.Reply | None:
-        """Late replies to earlier requests are dropped; number 0 is about the session itself."""
+        """Late replies to earlier requests are dropped; number 0 is about the session itself.
+
+        None also when the server's token goes: the caller looks whether the server is gone.
+        """
         deadline = time.monotonic() + wait
         while True:
             try:
                 data = self._replies.get(timeout=max(deadline - time.monotonic(), 0.0))
             except queue.Empty:
                 return None
+            if data is None:
+                return None
             reply = self._read(protocol.REPLY, data)
             if reply.sequence in (self._sequence, 0):
                 return reply
+
+    def _refuse_early_replies(self) -> None:
+        """A reply that is there before its request answers something that was not asked."""
+        while True:
+            try:
+                data = self._replies.get_nowait()
+            except queue.Empty:
+                return
+            reply = None if data is None else self._read(protocol.REPLY, data)
+            if reply is not None and reply.sequence == 0 and isinstance(reply, protocol.Refused):
+                raise self._lost(f"refused: {reply.reason}")
+            if reply is not None and reply.sequence > self._sequence:
+                raise self._lost(
+                    f"sent reply {reply.sequence} before its request: expected at most "
+                    f"{self._sequence}"
+                )
 
     def _read(self, codec: protocol.Codec[M], data: bytes) -> M:
         """What cannot be understood is no outcome."""
         try:
             return codec.decode(data)
         except protocol.CodecError as error:
-            raise RemoteFault(f"server {self.server}: {error}") from None
+            raise RemoteFault(f"{self._server}: {error}") from None
 
 
-def holder() -> str:
-    """Who holds a session, for the server's log."""
-    return f"rever_env process {os.getpid()}"
+class ForkedSession(RemoteSession):
+    """In a forked process: the description that the parent found, and a fault for every request.
+
+    Gymnasium's AsyncVectorEnv tells what a reset raises in its workers, but not what making an
+    environment raises there.
+    """
+
+    def __init__(self, fleet: Fleet, wanted: Wanted) -> None:
+        """ForkedProcess where the parent found no such server and task."""
+        for found, description in _last_found:
+            if found == fleet and wanted.among(description.tasks) is not None:
+                self.is_lost = False
+                self._describe(description, wanted)
+                return
+        require_own_process()
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+
+def opened(fleet: Fleet, wanted: Wanted) -> RemoteSession:
+    """A new session."""
+    try:
+        return RemoteSession(fleet, wanted)
+    except ForkedProcess:
+        return ForkedSession(fleet, wanted)
+
+
+_last_found: list[tuple[Fleet, protocol.Description]] = []  # one at most

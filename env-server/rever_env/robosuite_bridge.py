@@ -57,17 +57,22 @@ class _Stage:
 
 
 class BridgeTask(ManipulationEnv):  # type: ignore[misc]
-    """One Bridge task. begin(layout, seed) is a reset to a layout that can be repeated;
+    """One Bridge task in one of its variants.
 
-    reset() draws one from robosuite's own generator. reward: 1 when the task is solved, else 0.
+    begin(layout, seed) is a reset to a layout that can be repeated; reset() draws one from
+    robosuite's own generator. reward: 1 when the task is solved, else 0.
     """
 
     task_name = ""
 
     def __init__(
-        self, robots: Any = WidowX.__name__, controller_configs: Any = None, **arguments: Any
+        self,
+        robots: Any = WidowX.__name__,
+        controller_configs: Any = None,
+        variant: str = tasks.DEFAULT,
+        **arguments: Any,
     ):
-        self.task = _renamed(tasks.load()[self.task_name])
+        self.task = _renamed(tasks.find(tasks.load(), self.task_name, variant))
         self._placement: Layout | None = None
         self.memory: Memory | None = None
         arguments.setdefault("control_freq", self.task.control_hz)
@@ -166,7 +171,7 @@ def _environment(task: Task) -> str:
     return name
 
 
-ENVIRONMENTS = {task.name: _environment(task) for task in tasks.load().values()}
+ENVIRONMENTS = {task.name: _environment(task) for task in tasks.choose(tasks.load(), None)}
 
 
 def _renamed(task: Task) -> Task:

@@ -20,7 +20,8 @@ from robosuite.models.grippers.gripper_model import GripperModel
 from robosuite.models.robots.manipulators.manipulator_model import ManipulatorModel
 from robosuite.robots import register_robot_class
 
-from rever_env import tasks
+from rever_env import mjcf, tasks
+from rever_env.fault import InvalidReset
 from rever_env.tasks import Task
 
 Element = ElementTree.Element
@@ -30,13 +31,22 @@ _UNSEEN = {"size": "0.002", "group": "4", "rgba": "0 0 0 0"}
 
 def bridge_arena(task: Task) -> Arena:
     """Everything of a task's scene but the robot, objects included."""
-    with _written(_arena(_scene(task.scene))) as path:
+    scene = _scene(task)
+    robot = _base(scene)
+    for change in task.mjcf:
+        found = mjcf.elements(scene, change)
+        if change.element != "camera" and any(one in robot.iter() for one in found):
+            raise InvalidReset(
+                f"task {task.id}: robosuite's robot is the same in every task, and the task "
+                f"changes {change.element} {change.name} of it"
+            )
+    with _written(_arena(scene)) as path:
         return Arena(path)
 
 
 def fit_scene(model: Element, robot: ManipulatorModel, task: Task) -> None:
     """Puts robot and camera where the task's scene has them, and lights it as the scene does."""
-    scene = _scene(task.scene)
+    scene = _scene(task)
     base, root = _base(scene), robot.worldbody.find("body")
     root.attrib.update({name: base.attrib[name] for name in ("pos", "quat")})
     camera = {**base.find("camera").attrib}  # type: ignore[union-attr]
@@ -135,13 +145,12 @@ def _any_task() -> Task:
 
 def _any_scene() -> Element:
     """The robot is the same in every scene; where it stands is not: fit_scene."""
-    return _scene(_any_task().scene)
+    return _scene(_any_task())
 
 
-def _scene(path: Path) -> Element:
-    """A scene with its includes in place, and with what its default classes say at each element."""
-    scene = ElementTree.parse(path).getroot()
-    _include(scene, path.parent)
+def _scene(task: Task) -> Element:
+    """A task's scene with what its default classes say at each element."""
+    scene = mjcf.scene(task)
     classes: dict[str, dict[str, dict[str, str]]] = {}
     for node in scene.findall("default"):
         _collect(node, {}, classes)
@@ -149,19 +158,6 @@ def _scene(path: Path) -> Element:
     for node in scene.findall("worldbody"):
         _apply(node, "main", classes)
     return scene
-
-
-def _include(node: Element, folder: Path) -> None:
-    children: list[Element] = []
-    for child in node:
-        if child.tag == "include":
-            included = ElementTree.parse(folder / child.attrib["file"]).getroot()
-            _include(included, folder)
-            children += list(included)
-        else:
-            _include(child, folder)
-            children.append(child)
-    node[:] = children
 
 
 def _collect(
@@ -256,12 +252,15 @@ def _arena(scene: Element) -> Element:
 
 
 def _model(name: str, scene: Element, bodies: list[Element]) -> Element:
-    """A model with all materials: what is there twice, robosuite merges."""
+    """A model with the materials of its bodies: of two by one name robosuite keeps one."""
     model = ElementTree.Element("mujoco", model=name)
     ElementTree.SubElement(model, "compiler", angle="radian", autolimits="true")
     asset = ElementTree.SubElement(model, "asset")
+    used = {geom.get("material") for body in bodies for geom in body.iter("geom")}
     for assets in scene.findall("asset"):
-        asset.extend(copy.deepcopy(list(assets)))
+        asset.extend(
+            copy.deepcopy(one) for one in assets if one.tag != "material" or one.get("name") in used
+        )
     ElementTree.SubElement(model, "worldbody").extend(bodies)
     return model
 

@@ -37,7 +37,7 @@ _REVISION = 1
 
 @dataclass(frozen=True)
 class RobosuiteTask:
-    """A task of robosuite with a robot, which is the protocol's variant; or a Bridge task in it."""
+    """A Bridge task in one of its variants, or robosuite's own, whose variants are its robots."""
 
     name: str
     variant: str
@@ -60,12 +60,14 @@ def offered(
     """Every named task with every named robot; InvalidReset for an unknown name.
 
     robots: ROBOT, or ROBOT+ROBOT for a task of two. A Bridge task has its own robot, horizon and
-    control rate.
+    control rate, and may be named with a variant: see tasks.choose.
     """
     robosuite = load_robosuite()
     bridge = tasks.load()
-    own = {name: bridge_task(bridge[name]) for name in names if name in bridge}
-    names = [name for name in names if name not in own]
+    known_bridge = {tasks.ALL, *(task.name for task in bridge.values())}
+    ours = [name for name in names if tasks.TaskId.parse(name).task in known_bridge]
+    own = {str(task.id): bridge_task(task) for task in tasks.choose(bridge, ours)}
+    names = [name for name in names if name not in ours]
     for kind, given, known in (
         ("task", names, {*robosuite.ALL_ENVIRONMENTS, *bridge}),
         ("robot", [one for some in robots for one in some.split("+")], robosuite.ALL_ROBOTS),
@@ -171,7 +173,7 @@ def bridge_task(task: tasks.Task) -> RobosuiteTask:
         task.steps_max,
         task.state,
         task.action,
-        {"env_name": robosuite_bridge.ENVIRONMENTS[task.name]},
+        {"env_name": robosuite_bridge.ENVIRONMENTS[task.name], "variant": task.variant},
         task.control_hz,
         robosuite_bridge.CAMERA,
         task.version + _REVISION,

@@ -9,12 +9,9 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from rever_env import simulators
 from rever_env.protocol import limits
-
-if TYPE_CHECKING:
-    from rever_env.worlds import Worlds
 
 _FINISH_SECS_MAX = 10.0  # a wedged simulation is given up after that
 _PARENT_POLL_SECS = 0.5
@@ -55,55 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--id-file", type=Path, help="write the server's id there when it is ready, for health"
     )
-    _add_other_worlds(parser)
+    simulators.add_arguments(parser)
     parser.set_defaults(run=serve)
-
-
-def _add_other_worlds(parser: argparse.ArgumentParser) -> None:
-    others = parser.add_argument_group("worlds other than the Bridge tasks")
-    kinds = others.add_mutually_exclusive_group()
-    kinds.add_argument("--robosuite", nargs="+", metavar="TASK", help="robosuite's tasks, by name")
-    kinds.add_argument(
-        "--gymnasium", nargs="+", metavar="ID", help="Gymnasium's environments, by id"
-    )
-    others.add_argument(
-        "--robots",
-        nargs="+",
-        default=["Panda"],
-        metavar="ROBOT",
-        help="robosuite's (default: Panda)",
-    )
-    others.add_argument(
-        "--control-hz", type=float, default=20.0, help="of robosuite's tasks (default: 20)"
-    )
-    others.add_argument(
-        "--import",
-        dest="imports",
-        nargs="+",
-        default=[],
-        metavar="PACKAGE",
-        help="packages that register Gymnasium ids",
-    )
-    others.add_argument(
-        "--arguments", type=_arguments, default={}, metavar="JSON", help="for gymnasium.make"
-    )
-    others.add_argument(
-        "--wrapper", metavar="MODULE:CLASS", help="put around each Gymnasium environment"
-    )
-    others.add_argument(
-        "--horizon",
-        type=int,
-        default=500,
-        help="control steps of tasks that have no limit of their own (default: 500)",
-    )
-
-
-def _arguments(text: str) -> dict[str, Any]:
-    """ValueError, which argparse turns into its own words, for anything but a JSON object."""
-    arguments = json.loads(text)
-    if not isinstance(arguments, dict):
-        raise argparse.ArgumentTypeError(f"expected a JSON object, got {text}")
-    return arguments
 
 
 @dataclass(frozen=True)
@@ -174,7 +124,11 @@ def serve(arguments: argparse.Namespace) -> int:
         whole_images=endpoints.are_local,
     )
     failures: list[BaseException] = []
-    worlds = _worlds(arguments, options.sessions_max)
+    try:
+        worlds = simulators.make_worlds(arguments, options.sessions_max)
+    except simulators.UnusedOption as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     try:
         network = zenoh.open(zenoh.Config.from_json5(endpoints.configuration()))
     except zenoh.ZError as error:
@@ -210,43 +164,6 @@ def serve(arguments: argparse.Namespace) -> int:
             logging.error("the simulation did not end within %.0f s", _FINISH_SECS_MAX)
             os._exit(1)
     return 1 if failures else 0
-
-
-def _worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
-    from rever_env import tasks
-    from rever_env.worlds import Worlds
-
-    if arguments.robosuite:
-        from rever_env import robosuite_tasks, robosuite_world
-
-        offered = robosuite_tasks.offered(
-            arguments.robosuite, arguments.robots, arguments.horizon, arguments.control_hz
-        )
-        return Worlds(
-            offered, idle_max, robosuite_world.RobosuiteWorld, robosuite_tasks.simulator()
-        )
-    if arguments.gymnasium:
-        return _gymnasium_worlds(arguments, idle_max)
-    return Worlds(tasks.load(), idle_max)
-
-
-def _gymnasium_worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
-    from rever_env import gymnasium_world
-    from rever_env.worlds import Worlds
-
-    wrapper = gymnasium_world.imported(arguments.wrapper) if arguments.wrapper else None
-    making = gymnasium_world.Making(arguments.arguments, wrapper)
-    offered = gymnasium_world.offered(
-        arguments.gymnasium, arguments.imports, making, arguments.horizon
-    )
-    has_images = any(task.has_image for task in offered.values())
-    return Worlds(
-        offered,
-        idle_max,
-        gymnasium_world.GymnasiumWorld,
-        gymnasium_world.simulator(arguments.imports),
-        limits.IMAGE_SIDE_MAX if has_images else 0,
-    )
 
 
 def _wait(stop: threading.Event, parent: int | None) -> None:

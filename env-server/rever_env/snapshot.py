@@ -40,6 +40,7 @@ def pack(
             memory.target_origin,
             memory.source_half,
             memory.target_half,
+            *memory.distractor_origins,
         ]
     ).astype("<f8")
     header = _HEADER.pack(
@@ -67,14 +68,15 @@ def unpack(
     Whoever calls it brings what follows from the state up to date.
     """
     size = mujoco.mj_stateSize(model, _STATE)
-    expected = _HEADER.size + 8 * (size + 17)
+    floats_count = size + 17 + 2 * len(task.distractors)
+    expected = _HEADER.size + 8 * floats_count
     if len(content) != expected:
         raise InvalidSnapshot(f"snapshot: expected {expected} bytes, got {len(content)}")
     magic, digest, steps, grasped_steps, count, ever, consecutive, success = _HEADER.unpack_from(
         content
     )
-    if magic != _MAGIC or digest != _digest(task) or count != size + 17:
-        raise InvalidSnapshot(f"snapshot: expected one of task {task.name}, got another")
+    if magic != _MAGIC or digest != _digest(task) or count != floats_count:
+        raise InvalidSnapshot(f"snapshot: expected one of task {task.id}, got another")
     floats = np.frombuffer(content, dtype="<f8", offset=_HEADER.size).astype(np.float64)
     if not np.isfinite(floats).all():
         raise InvalidSnapshot("snapshot: expected finite numbers, got NaN or infinity")
@@ -87,6 +89,7 @@ def unpack(
         target_origin=rest[9:11].copy(),
         source_half=rest[11:14].copy(),
         target_half=rest[14:17].copy(),
+        distractor_origins=tuple(rest[17:].reshape(-1, 2).copy()),
         grasped_steps=grasped_steps,
         ever_grasped=bool(ever),
         consecutive_grasp=bool(consecutive),

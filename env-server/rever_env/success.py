@@ -19,6 +19,7 @@ class Memory:
 
     source_origin: Vector  # settled xy of the source's origin, metres
     target_origin: Vector
+    distractor_origins: tuple[Vector, ...]
     source_half: Vector  # settled half extents, rotated as SIMPLER does, metres
     target_half: Vector
     grasped_steps: int = 0
@@ -60,6 +61,7 @@ class Judge:
         self._task = task
         self._source = model.body(task.source).id
         self._target = model.body(task.target).id
+        self._distractors = [model.body(distractor.body).id for distractor in task.distractors]
         self._fingers = [model.body(name).id for name in task.settings.finger_bodies]
         robot_root = model.body(task.settings.robot_body).id
         self._is_robot = [_descends(model, body, robot_root) for body in range(model.nbody)]
@@ -69,6 +71,7 @@ class Judge:
         return Memory(
             source_origin=data.xpos[self._source][:2].copy(),
             target_origin=data.xpos[self._target][:2].copy(),
+            distractor_origins=tuple(data.xpos[body][:2].copy() for body in self._distractors),
             source_half=_half_extents(data.xquat[self._source], self._task.source_extents),
             target_half=_half_extents(data.xquat[self._target], self._task.target_extents),
         )
@@ -84,7 +87,12 @@ class Judge:
         # SIMPLER compares the settled origin with the current centre of mass here; the
         # offset between the two leaks into the source's displacement and is kept.
         source_moved = norm(data.xipos[self._source][:2] - memory.source_origin)
-        target_moved = norm(data.xpos[self._target][:2] - memory.target_origin)
+        others = zip(
+            (self._target, *self._distractors),
+            (memory.target_origin, *memory.distractor_origins),
+            strict=True,
+        )
+        other_moved = max(norm(data.xpos[body][:2] - origin) for body, origin in others)
         on_target = self.on_target(data, memory, touch)
         memory.ever_success |= on_target
         return Statistics(
@@ -92,8 +100,8 @@ class Judge:
             is_grasped=grasped,
             ever_grasped=memory.ever_grasped,
             consecutive_grasp=memory.consecutive_grasp,
-            moved_correct_object=source_moved > rule.moved_min and source_moved > target_moved,
-            moved_wrong_object=target_moved > rule.moved_min and target_moved > source_moved,
+            moved_correct_object=source_moved > rule.moved_min and source_moved > other_moved,
+            moved_wrong_object=other_moved > rule.moved_min and other_moved > source_moved,
             source_on_target=on_target,
             ever_success=memory.ever_success,
             released_success=on_target and not touch.robot and (touch.target or touch.elsewhere),

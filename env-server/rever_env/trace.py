@@ -1,4 +1,4 @@
-"""The trace subcommand: every number of an episode, to hold two simulators beside one another."""
+"""The trace subcommand: every number of episodes, to compare two simulators."""
 
 import hashlib
 import json
@@ -15,21 +15,24 @@ from rever_env.world import Observation, Statistics, World
 
 
 def lines(
-    task: Task, layout: int | None, seed: int, actions: Path | None, side: int
+    task: Task, starts: list[tuple[int | None, int]], actions: Path | None, side: int
 ) -> Iterator[str]:
-    """One JSON object for the reset and one for each step, to the horizon or the actions' end.
+    """One JSON object for each reset and each step, to the horizon or the actions' end.
 
-    Floats stand as their bits, 16 (or 8) hexadecimal digits. actions: a file of one action per
-    line, 7 numbers; without it the scripted expert acts.
+    starts: layout and seed of each episode; all of them run in the same environment. actions: a
+    file of one action per line, 7 numbers; without it the scripted expert acts. Floats stand as
+    their bits, 16 (or 8) hexadecimal digits.
     """
     with World(task, side, side) as world:
-        observation = world.reset(layout=layout, seed=seed)
-        yield _line(world, observation, None)
-        for action in read(actions) if actions else _expert(world):
-            transition = world.step(action)
-            yield _line(world, transition.observation, transition.statistics)
-            if transition.truncated:
-                break
+        for layout, seed in starts:
+            name = f"{task.id}, layout {'random' if layout is None else layout}, seed {seed}"
+            observation = world.reset(layout=layout, seed=seed)
+            yield _line(name, world, observation, None)
+            for action in read(actions) if actions else _expert(world):
+                transition = world.step(action)
+                yield _line(name, world, transition.observation, transition.statistics)
+                if transition.truncated:
+                    break
 
 
 def read(file: Path) -> Iterator[NDArray[np.float64]]:
@@ -43,9 +46,13 @@ def _expert(world: World) -> Iterator[NDArray[np.float64]]:
         yield world.expert_action().astype(np.float32).astype(np.float64)
 
 
-def _line(world: World, observation: Observation, statistics: Statistics | None) -> str:
+def _line(
+    episode: str, world: World, observation: Observation, statistics: Statistics | None
+) -> str:
     return json.dumps(
         {
+            "episode": episode,
+            "step": world.steps,
             "qpos": _bits(world.data.qpos),
             "qvel": _bits(world.data.qvel),
             "state": _bits(observation.state),

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rever_env import expert, snapshot
+from rever_env import expert, mjcf, snapshot
 from rever_env.camera import Camera
 from rever_env.controller import Controller, consecutive
 from rever_env.fault import (
@@ -21,7 +21,7 @@ from rever_env.layout import place
 from rever_env.pose import in_base
 from rever_env.protocol import Statistics
 from rever_env.success import Judge, Memory
-from rever_env.tasks import Layout, Task
+from rever_env.tasks import Layout, Pose, Task
 
 __all__ = [
     "Fault",
@@ -83,7 +83,7 @@ class World:
     def __init__(self, task: Task, image_height: int = 128, image_width: int = 128) -> None:
         silence_warnings()
         self.task = task
-        self.model = mujoco.MjModel.from_xml_path(str(task.scene))
+        self.model = mjcf.compile(task)
         assert self.model.opt.timestep == task.settings.timestep, "scene and tasks.toml disagree"
         self.data = mujoco.MjData(self.model)
         self.controller = Controller(self.model, task)
@@ -241,7 +241,7 @@ class World:
         words = broken(self.model, self.data)
         if words:
             self.memory = None
-            raise PhysicsDiverged(f"physics of {self.task.name} at step {self.steps}: {words}")
+            raise PhysicsDiverged(f"physics of {self.task.id} at step {self.steps}: {words}")
 
     def _observe(self) -> Observation:
         return Observation(
@@ -283,13 +283,15 @@ def divergence(data: mujoco.MjData) -> list[str]:
 
 
 def place_objects(model: mujoco.MjModel, data: mujoco.MjData, task: Task, layout: Layout) -> None:
-    """Puts source and target above where they will rest."""
-    rows = [(task.source, layout.source_x, layout.source_y, task.source_height)]
-    yaws = [layout.source_yaw]
+    """Puts source, target and distractors above where they will rest."""
+    source = Pose(layout.source_x, layout.source_y, layout.source_yaw)
+    rows = [(task.source, source, task.source_height)]
     if task.target_height is not None:
-        rows.append((task.target, layout.target_x, layout.target_y, task.target_height))
-        yaws.append(0.0)
-    for (name, x, y, height), yaw in zip(rows, yaws, strict=True):
+        target = Pose(layout.target_x, layout.target_y, 0.0)
+        rows.append((task.target, target, task.target_height))
+    for distractor, pose in zip(task.distractors, layout.distractors, strict=True):
+        rows.append((distractor.body, pose, distractor.height))
+    for name, (x, y, yaw), height in rows:
         start = model.joint(name).qposadr[0]
         data.qpos[start : start + 3] = (x, y, height + _START_GAP)
         quaternion = np.zeros(4)

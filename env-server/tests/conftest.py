@@ -1,7 +1,10 @@
-"""What the Python tests share: the software renderer, one world per task, free ports."""
+"""What the Python tests share: the software renderer, worlds, free ports and server processes."""
 
+import contextlib
 import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -41,3 +44,42 @@ def free_endpoint() -> str:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+
+
+def serve(endpoint: str, *arguments: str) -> "subprocess.Popen[str]":
+    """A server process that is ready; whoever starts it ends it."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rever_env", "serve", "--listen", endpoint, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("ready ")
+    return process
+
+
+def end(process: "subprocess.Popen[str]") -> None:
+    """Kills a server, stopped or not."""
+    process.kill()
+    process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+@contextlib.contextmanager
+def served(*arguments: str) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
+    """The endpoint of a server, and its process."""
+    endpoint = free_endpoint()
+    process = serve(endpoint, *arguments)
+    try:
+        yield endpoint, process
+    finally:
+        end(process)
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    """A server of the Bridge tasks."""
+    with served() as (endpoint, _):
+        yield endpoint

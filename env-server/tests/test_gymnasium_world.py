@@ -11,10 +11,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rever_env.fault import InvalidAction, InvalidReset, PhysicsDiverged
-from rever_env.gymnasium_world import GymnasiumWorld, Making, NotReproducible, imported, offered
+from rever_env.gymnasium_tasks import Making, imported, offered
+from rever_env.gymnasium_world import GymnasiumWorld, NotReproducible
 from rever_env.protocol import Dimension
 from rever_env.server import Server, ServerOptions
-from rever_env.spaces import dimensions_of, numbers_of, value_of
+from rever_env.space_parts import dimensions_of, numbers_of, value_of
 from rever_env.world import Observation
 from rever_env.worlds import Worlds
 

@@ -1,50 +1,26 @@
 """Environments in another process, as Gymnasium environments: real servers, real sockets."""
 
+import os
+import signal
 import subprocess
-import sys
+import time
 import warnings
-from collections.abc import Iterator
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from conftest import free_endpoint
+from conftest import free_endpoint, served
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 
 import rever_env
 from rever_env import protocol
 from rever_env.remote_session import RemoteFault, RemoteRefused
 from rever_env.tasks import Task
-from rever_env.world import World
 
 SPOON = "widowx_spoon_on_towel"
 STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
-
-
-def serve(endpoint: str, *arguments: str) -> "subprocess.Popen[str]":
-    """A server process that is ready."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rever_env", "serve", "--listen", endpoint, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("ready ")
-    return process
-
-
-@pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    endpoint = free_endpoint()
-    process = serve(endpoint)
-    yield endpoint
-    process.kill()
-    process.wait()
 
 
 def test_the_checker_passes_over_the_wire_without_a_warning(endpoint: str) -> None:
@@ -56,70 +32,66 @@ def test_the_checker_passes_over_the_wire_without_a_warning(endpoint: str) -> No
 
 
 def test_a_gymnasium_environment_is_the_same_behind_a_server() -> None:
-    endpoint = free_endpoint()
-    process = serve(endpoint, "--gymnasium", "CartPole-v1")
-    remote = rever_env.RemoteEnv(endpoint, image_height=0, image_width=0)
-    local = gymnasium.make("CartPole-v1")
-    assert remote.session.task.task == "CartPole-v1"
-    assert remote.action_space == gymnasium.spaces.Discrete(2)
-    fields: Any = remote.observation_space
-    assert fields["state"] == gymnasium.spaces.Box(
-        np.array([-4.8, -np.inf, -0.41887903, -np.inf], np.float32),
-        np.array([4.8, np.inf, 0.41887903, np.inf], np.float32),
-    )
-    observation, _ = remote.reset(seed=3)
-    expected, _ = local.reset(seed=3)
-    terminated = False
-    while not terminated:
-        assert set(observation) == {"state", "instruction"}
-        assert np.array_equal(observation["state"], expected)
-        action = int(expected[2] < 0.01)
-        observation, reward, terminated, truncated, info = remote.step(np.int64(action))
-        expected, *same = local.step(action)
-        assert (reward, terminated, truncated) == tuple(same[:3])
-        assert not info["is_success"]
-    with pytest.raises(RemoteRefused, match="it has ended"):
-        remote.step(np.int64(0))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        # CartPole's speeds have no bound, of which the checker warns there, too.
-        warnings.filterwarnings("ignore", message=".*A Box observation space")
-        made = gymnasium.make(
-            "rever_env:rever/Remote-v1", connect=endpoint, image_height=0, image_width=0
+    with served("--gymnasium", "CartPole-v1") as (endpoint, _):
+        remote = rever_env.RemoteEnv(endpoint, image_height=0, image_width=0)
+        local = gymnasium.make("CartPole-v1")
+        assert remote.session.task.task == "CartPole-v1"
+        assert remote.metadata["render_fps"] == local.metadata["render_fps"] == 50
+        assert remote.action_space == gymnasium.spaces.Discrete(2)
+        fields: Any = remote.observation_space
+        assert fields["state"] == gymnasium.spaces.Box(
+            np.array([-4.8, -np.inf, -0.41887903, -np.inf], np.float32),
+            np.array([4.8, np.inf, 0.41887903, np.inf], np.float32),
         )
-        check_env(made.unwrapped, skip_close_check=True)
-    made.close()
-    remote.close()
-    process.kill()
-    process.wait()
+        observation, _ = remote.reset(seed=3)
+        expected, _ = local.reset(seed=3)
+        terminated = False
+        while not terminated:
+            assert set(observation) == {"state", "instruction"}
+            assert np.array_equal(observation["state"], expected)
+            action = int(expected[2] < 0.01)
+            observation, reward, terminated, truncated, info = remote.step(np.int64(action))
+            expected, *same = local.step(action)
+            assert (reward, terminated, truncated) == tuple(same[:3])
+            assert not info["is_success"]
+        with pytest.raises(RemoteRefused, match="it has ended"):
+            remote.step(np.int64(0))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            # CartPole's speeds have no bound, of which the checker warns there, too.
+            warnings.filterwarnings("ignore", message=".*A Box observation space")
+            made = gymnasium.make(
+                "rever_env:rever/Remote-v1", connect=endpoint, image_height=0, image_width=0
+            )
+            check_env(made.unwrapped, skip_close_check=True)
+        made.close()
+        remote.close()
 
 
-def test_a_session_that_the_server_ended_says_why_and_closes_at_once() -> None:
-    endpoint = free_endpoint()
-    process = serve(endpoint)
-    remote = rever_env.RemoteEnv(endpoint, SPOON, image_height=0, image_width=0)
-    remote.reset(seed=1)
-    remote.session._declared.pop().undeclare()  # the holder's token
-    for _ in range(2):
-        with pytest.raises(RemoteRefused, match="ended: its holder is gone"):
-            remote.step(STILL)
-    remote.close()
-    process.kill()
-    process.wait()
-
-
-def test_it_is_the_same_world(endpoint: str, task: Task, world: World) -> None:
-    remote = rever_env.RemoteEnv(endpoint, task.name, expert=True)
+def test_it_is_the_same_environment(endpoint: str, task: Task) -> None:
+    """Spaces, observations and info, for actions of any size."""
+    remote = rever_env.RemoteEnv(endpoint, task.name, task.variant, expert=True)
+    local = rever_env.BridgeEnv(*task.id)
+    assert remote.session.task.variant == task.variant
+    assert remote.observation_space == local.observation_space
+    assert remote.action_space == local.action_space
+    assert remote.metadata == local.metadata
     observation, info = remote.reset(seed=9, options={"layout": 4})
-    expected = world.reset(layout=4, seed=9)
-    for _ in range(5):
-        assert np.array_equal(observation["image"], expected.image)
-        assert np.array_equal(observation["state"], expected.state)
-        action = info["expert_action"]
-        assert np.array_equal(action, world.expert_action().astype(np.float32))
-        observation, _, _, _, info = remote.step(action)
-        expected = world.step(action.astype(np.float64)).observation
+    expected, _ = local.reset(seed=9, options={"layout": 4})
+    far = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0])
+    for step in range(8):
+        assert np.array_equal(observation["image"], expected["image"])
+        assert np.array_equal(observation["state"], expected["state"])
+        action = info.pop("expert_action") if step < 6 else far
+        if step < 6:
+            assert np.array_equal(action, local.world.expert_action().astype(np.float32))
+        observation, *result, info = remote.step(action)
+        expected, *expected_result, expected_info = local.step(action)
+        assert result == expected_result
+        assert {**info, "expert_action": None} == {**expected_info, "expert_action": None}
+    assert info["action_followed"] is False
     remote.close()
+    local.close()
 
 
 def test_an_episode_ends_at_the_horizon_and_refuses_more(endpoint: str) -> None:
@@ -133,32 +105,119 @@ def test_an_episode_ends_at_the_horizon_and_refuses_more(endpoint: str) -> None:
     remote.close()
 
 
+def test_images_are_writable(endpoint: str) -> None:
+    remote = rever_env.RemoteEnv(endpoint, image_height=8, image_width=8)
+    for observation in (remote.reset(seed=0)[0], remote.step(STILL)[0]):
+        rendered = remote.render()
+        observation["image"] += 1
+        observation["state"] += 1
+        assert rendered is not None and not np.array_equal(rendered, observation["image"])
+        rendered[:] = 0
+        again = remote.render()
+        assert again is not None and again.any()
+    remote.close()
+
+
 def test_what_is_wrong_is_said(endpoint: str) -> None:
     with pytest.raises(RemoteRefused, match=r"expected one of the tasks .* got fold_towel"):
         rever_env.RemoteEnv(endpoint, "fold_towel")
-    with pytest.raises(RemoteFault, match="cannot reach"):
-        rever_env.RemoteEnv(free_endpoint(), wait_secs=0.5)
     remote = rever_env.RemoteEnv(endpoint)
     with pytest.raises(RemoteRefused, match="expected Reset first"):
         remote.step(STILL)
-    with pytest.raises(ValueError, match=r"expected shape \(7,\), got \(6,\)"):
-        remote.step(np.zeros(6, np.float32))
     with pytest.raises(ValueError, match="expected only 'layout'"):
         remote.reset(options={"configuraton": 4})
     for layout in (-1, 3.0, True, 1 << 32):
         with pytest.raises(ValueError, match="expected a whole number from 0 to 4294967295, got"):
             remote.reset(options={"layout": layout})
+    with pytest.raises(ValueError, match="seed: expected a whole number from 0 to 90071992547409"):
+        remote.reset(seed=1 << 53)
     with pytest.raises(RemoteRefused, match="layout 999: expected"):
         remote.reset(options={"layout": 999})
-    remote.reset(seed=0, options={"layout": np.int64(3)})
-    with pytest.raises(ValueError, match="expected finite numbers"):
-        remote.step(np.full(7, np.nan, np.float32))
+    numpys: Any = np.int64(3)
+    remote.reset(seed=numpys, options={"layout": np.int64(3)})
+    remote.close()
+    remote.close()
+    for act in (remote.reset, lambda: remote.step(STILL)):
+        with pytest.raises(ClosedEnvironmentError, match="close"):
+            act()
+
+
+@pytest.mark.parametrize(
+    "written",
+    ["http://127.0.0.1:7447", "tcp/127.0.0.1", "127.0.0.1", "tcp/127.0.0.1:99999", "tcp/:1", ""],
+)
+def test_endpoints_are_checked_at_once(written: str) -> None:
+    with pytest.raises(ValueError, match=r"endpoint '.*': expected tcp/HOST:PORT or HOST:PORT"):
+        rever_env.RemoteEnv(written)
+
+
+def test_an_endpoint_needs_no_protocol(endpoint: str) -> None:
+    rever_env.RemoteEnv(endpoint.removeprefix("tcp/"), image_height=0, image_width=0).close()
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        ("tcp/{free}", r"cannot connect to .*: connection refused; is `python -m rever_env serve"),
+        ("tcp/host.invalid:7447", "host host.invalid: "),
+        ("fleet", r'no environment server found at tcp/\S+ within 2 s \(fleet "other"\)'),
+        ("server", 'no environment server with id "other" found at tcp/'),
+    ],
+)
+def test_who_is_not_there_is_told_within_seconds(endpoint: str, where: str, words: str) -> None:
+    begun = time.monotonic()
+    with pytest.raises(RemoteFault, match=words) as fault:
+        if where.startswith("tcp/"):
+            rever_env.RemoteEnv(where.format(free=free_endpoint().removeprefix("tcp/")))
+        else:
+            rever_env.RemoteEnv(endpoint, **{where: "other"})  # type: ignore[arg-type]
+    assert time.monotonic() - begun < 10.0
+    assert ".rs" not in str(fault.value)
+
+
+def stopped_reply(process: "subprocess.Popen[str]", remote: Any, data: bytes) -> None:
+    """Sends a step to a stopped server, and a reply to it in the server's place."""
+    session = remote.session
+    os.kill(process.pid, signal.SIGSTOP)
+    try:
+        remote.send_step(STILL)
+        session._network.zenoh.put(reply_key(remote), data)
+        remote.receive_step()
+    finally:
+        os.kill(process.pid, signal.SIGCONT)
+
+
+def reply_key(remote: Any) -> str:
+    """The key of the session's replies."""
+    return str(remote.session._publisher.key_expr).removesuffix("request") + "reply"
+
+
+def test_a_reply_that_cannot_be_understood_is_a_fault_and_no_reward() -> None:
+    with served() as (endpoint, process):
+        remote = rever_env.RemoteEnv(endpoint, image_height=16, image_width=16)
+        for number, words in ((0, "reply cannot be read"), (4, "16 x 16 pixels as before")):
+            remote.reset(seed=0)
+            data = protocol.REPLY.encode(stepped(number)) if number else b"\xc1"
+            with pytest.raises(RemoteFault, match=words):
+                stopped_reply(process, remote, data)
+        remote.reset(seed=0)
+        remote.step(STILL)
+        remote.close()
+
+
+def test_a_reply_that_precedes_its_request_is_a_fault_and_no_reward(endpoint: str) -> None:
+    remote = rever_env.RemoteEnv(endpoint, image_height=16, image_width=16)
+    remote.reset(seed=0)
+    remote.session._network.zenoh.put(reply_key(remote), protocol.REPLY.encode(stepped(2)))
+    with pytest.raises(RemoteFault, match="sent reply 2 before its request"):
+        remote.step(STILL)
+    remote.reset(seed=0)
+    remote.step(STILL)
     remote.close()
 
 
-def test_a_reply_that_cannot_be_understood_is_a_fault_and_no_reward(endpoint: str) -> None:
-    remote = rever_env.RemoteEnv(endpoint, image_height=16, image_width=16)
-    remote.reset(seed=0)
+def stepped(number: int) -> protocol.Stepped:
+    """A reply whose image is of another size."""
     transition = protocol.Transition(
         protocol.Observation(protocol.Image(32, 32, b""), (0.0,) * 8, "", None),
         protocol.Statistics(*[False] * 9),
@@ -166,16 +225,29 @@ def test_a_reply_that_cannot_be_understood_is_a_fault_and_no_reward(endpoint: st
         False,
         False,
     )
-    unlike = protocol.REPLY.encode(protocol.Stepped(4, transition, (), 0))  # the fourth request
-    session = remote.session
-    key = str(session._publisher.key_expr).removesuffix("request") + "reply"
-    for data, words in ((b"\xc1", "reply cannot be read"), (unlike, "16 x 16 pixels as before")):
-        session._network.put(key, data)  # a server's, as far as anyone can tell
-        with pytest.raises(RemoteFault, match=words):
-            remote.step(STILL)
-        remote.reset(seed=0)
+    return protocol.Stepped(number, transition, (), 0)
+
+
+def test_a_session_that_the_server_ended_says_why_and_reset_opens_another(endpoint: str) -> None:
+    remote = rever_env.RemoteEnv(endpoint, SPOON, image_height=0, image_width=0)
+    remote.reset(seed=1)
+    remote.session._network._declared.pop().undeclare()  # the holder's token
+    with pytest.raises(RemoteFault, match="ended: its holder is gone"):
+        remote.step(STILL)
+    with pytest.raises(RemoteFault, match="the session is lost, and reset opens a new one"):
+        remote.step(STILL)
+    remote.reset(seed=1)
     remote.step(STILL)
     remote.close()
+
+
+def test_a_task_may_be_named_with_its_variant(endpoint: str) -> None:
+    remote = rever_env.RemoteEnv(endpoint, f"{SPOON}/distractors", image_height=0, image_width=0)
+    assert (remote.session.task.task, remote.session.task.variant) == (SPOON, "distractors")
+    remote.reset(seed=0)
+    remote.close()
+    with pytest.raises(RemoteRefused, match=f"{SPOON}/distractors, .* got {SPOON}/upside-down"):
+        rever_env.RemoteEnv(endpoint, SPOON, "upside-down")
 
 
 def test_no_step_follows_one_whose_reply_was_not_taken(endpoint: str) -> None:
@@ -187,132 +259,3 @@ def test_no_step_follows_one_whose_reply_was_not_taken(endpoint: str) -> None:
     assert np.array_equal(remote.reset(seed=0)[0]["image"], first["image"])
     remote.step(STILL)
     remote.close()
-
-
-def test_a_wrong_action_moves_no_environment_of_a_vector(endpoint: str) -> None:
-    environments = vector(endpoint, AutoresetMode.DISABLED)
-    seeds: Any = [5, 6]
-    environments.reset(seed=seeds)
-    actions = np.tile(STILL, (2, 1))
-    actions[1, 0] = np.nan
-    with pytest.raises(ValueError, match="expected finite numbers"):
-        environments.step(actions)
-    observation, *_ = run(environments, 1)
-    alone = rever_env.RemoteEnv(endpoint, image_height=8, image_width=8)
-    alone.reset(seed=5)
-    assert np.array_equal(observation["state"][0], alone.step(STILL)[0]["state"])
-    alone.close()
-    environments.close()
-
-
-def test_a_killed_server_is_a_fault_and_no_reward() -> None:
-    endpoint = free_endpoint()
-    process = serve(endpoint)
-    remote = rever_env.RemoteEnv(endpoint, image_height=8, image_width=8)
-    remote.reset(seed=0)
-    process.kill()
-    process.wait()
-    with pytest.raises(RemoteFault):
-        remote.step(STILL)
-    remote.close()
-
-
-def vector(endpoint: str, mode: AutoresetMode) -> rever_env.RemoteVectorEnv:
-    return rever_env.RemoteVectorEnv(
-        endpoint, 2, autoreset_mode=mode, image_height=8, image_width=8
-    )
-
-
-def run(environments: rever_env.RemoteVectorEnv, steps: int) -> tuple[Any, ...]:
-    result: tuple[Any, ...] = ()
-    for _ in range(steps):
-        result = environments.step(np.tile(STILL, (2, 1)))
-    return result
-
-
-def test_a_vector_is_its_environments(endpoint: str) -> None:
-    environments = vector(endpoint, AutoresetMode.DISABLED)
-    seeds: Any = [5, 6]
-    together, infos = environments.reset(seed=seeds)
-    assert infos["seed"].tolist() == [5, 6]
-    stepped = run(environments, 2)
-    alone = rever_env.RemoteEnv(endpoint, image_height=8, image_width=8)
-    for index in range(2):
-        first, _ = alone.reset(seed=5 + index)
-        assert np.array_equal(together["image"][index], first["image"])
-        alone.step(STILL)
-        observation, *_ = alone.step(STILL)
-        assert np.array_equal(stepped[0]["state"][index], observation["state"])
-    alone.close()
-    environments.close()
-
-
-def test_without_autoreset_the_mask_says_which_begin_again(endpoint: str) -> None:
-    environments = vector(endpoint, AutoresetMode.DISABLED)
-    environments.reset(seed=0)
-    assert run(environments, 60)[3].tolist() == [True, True]
-    with pytest.raises(ValueError, match=r"environments \[0, 1\] have ended"):
-        run(environments, 1)
-    environments.reset(seed=1, options={"reset_mask": np.array([True, False])})
-    with pytest.raises(ValueError, match=r"environments \[1\] have ended"):
-        run(environments, 1)
-    environments.close()
-
-
-def test_autoreset_begins_at_the_next_step_or_the_same(endpoint: str) -> None:
-    environments = vector(endpoint, AutoresetMode.NEXT_STEP)
-    environments.reset(seed=0)
-    assert run(environments, 60)[3].tolist() == [True, True]
-    _, rewards, _, truncated, infos = run(environments, 1)
-    assert truncated.tolist() == [False, False] and rewards.tolist() == [0.0, 0.0]
-    assert infos["_seed"].all() and "is_success" not in infos
-    environments.close()
-    environments = vector(endpoint, AutoresetMode.SAME_STEP)
-    environments.reset(seed=0)
-    observation, _, _, truncated, infos = run(environments, 60)
-    assert truncated.tolist() == [True, True]
-    last = infos["final_obs"][0]
-    assert not np.array_equal(last["image"], observation["image"][0])
-    environments.close()
-
-
-def test_make_vec_deals_environments_out(endpoint: str) -> None:
-    environments: Any = gymnasium.make_vec(
-        "rever_env:rever/Remote-v1", num_envs=3, connect=[endpoint, endpoint], task=SPOON
-    )
-    observation, _ = environments.reset(seed=0)
-    assert observation["image"].shape == (3, 128, 128, 3)
-    assert environments.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
-    environments.close()
-
-
-def test_lerobot_finds_its_environments(endpoint: str) -> None:
-    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-    import env
-
-    for cfg in (None, SimpleNamespace(connect=endpoint, image_side=32)):
-        suites = env.make_env(n_envs=2, cfg=cfg)
-        for environments in suites["rever"].values():
-            seeds: Any = [1, 2]
-            observation, infos = environments.reset(seed=seeds)
-            side = 256 if cfg is None else 32
-            assert observation["pixels"].shape == (2, side, side, 3)
-            assert observation["agent_pos"].shape == (2, 8)
-            assert infos["is_success"].tolist() == [False, False]
-            first: Any = environments
-            assert first.envs[0].unwrapped.task_description
-            environments.close()
-
-
-def test_the_example_of_the_readme_runs(endpoint: str) -> None:
-    readme = Path(__file__).resolve().parents[2] / "README.md"
-    (block,) = [
-        block.removeprefix("python\n")
-        for block in readme.read_text(encoding="utf-8").split("```")
-        if block.startswith("python\n") and "rever/Remote-v1" in block
-    ]
-    lines = [line for line in block.splitlines() if line.strip()]
-    assert len(lines) <= 10
-    names: dict[str, Any] = {}
-    exec(block.replace("tcp/127.0.0.1:7447", endpoint), names)
-    assert names["info"]["is_success"] in (True, False) and names["truncated"]

@@ -280,7 +280,8 @@ def test_a_server_describes_itself_and_ends_on_a_signal() -> None:
             for reply in network.get(protocol.Keys("home").describe(name), timeout=WAIT_SECS):
                 description = protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes())
         assert (description.server, description.sessions_max) == (name, 3)
-        assert {task.task for task in description.tasks} == tasks.load().keys()
+        offered = {(task.task, task.variant) for task in description.tasks}
+        assert offered == {task.id for task in tasks.load().values()}
         process.send_signal(signal.SIGTERM)
         assert process.wait(WAIT_SECS) == 0
 

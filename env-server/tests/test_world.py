@@ -8,6 +8,7 @@ import pytest
 from conftest import TASKS
 from numpy.typing import NDArray
 
+from rever_env import mjcf
 from rever_env.snapshot import InvalidSnapshot
 from rever_env.tasks import Task
 from rever_env.world import InvalidAction, Observation, PhysicsDiverged, Transition, World
@@ -52,7 +53,7 @@ def test_the_same_reset_gives_the_same_bytes(world: World, task: Task) -> None:
 def test_what_lies_beyond_the_edges_is_left_out_and_changes_no_pixel(
     world: World, task: Task
 ) -> None:
-    model = mujoco.MjModel.from_xml_path(str(task.scene))
+    model = mjcf.compile(task)
     height, width = world.reset(layout=1, seed=0).image.shape[:2]
     with mujoco.Renderer(model, height, width) as whole:
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):

@@ -3,7 +3,7 @@
 use protocol::limits::SEED_END;
 
 use crate::fault::Fault;
-use crate::tasks::{Layout, Task};
+use crate::tasks::{Layout, Pose, Task};
 
 const DRAWS_MAX: usize = 10_000;
 
@@ -34,35 +34,66 @@ pub fn place(task: &Task, layout: Option<u32>, seed: u64) -> Result<Layout, Faul
     }
     let Some(layout) = layout else { return draw(task, seed) };
     let layouts = &task.rule.grid.layouts;
-    layouts.get(layout as usize).copied().ok_or_else(|| {
+    layouts.get(layout as usize).cloned().ok_or_else(|| {
         Fault::Wrong(format!(
             "layout {layout}: expected 0 <= layout < {} for task {}",
             layouts.len(),
-            task.name
+            task.id.task
         ))
     })
 }
 
 fn draw(task: &Task, seed: u64) -> Result<Layout, Fault> {
     let ranges = &task.rule.random;
-    let mut generator = SplitMix64 { state: fnv1a(&task.name) ^ seed };
+    let mut generator = SplitMix64 { state: fnv1a(&task.id.task) ^ seed };
     for _ in 0..DRAWS_MAX {
-        let layout = Layout {
+        let mut layout = Layout {
             source_x: generator.uniform(ranges.source_x),
             source_y: generator.uniform(ranges.source_y),
             source_yaw: generator.uniform(ranges.source_yaw),
             target_x: generator.uniform(ranges.target_x),
             target_y: generator.uniform(ranges.target_y),
+            distractors: Vec::new(),
         };
         let apart = distance(layout.source_x - layout.target_x, layout.source_y - layout.target_y);
         if apart >= ranges.separation_min && !is_near_grid_layout(task, &layout) {
+            // After source and target, which are then where they are without distractors.
+            layout.distractors = draw_distractors(task, &layout, &mut generator, seed)?;
             return Ok(layout);
         }
     }
-    Err(Fault::Wrong(format!(
-        "task {}, seed {seed}: no free layout in {DRAWS_MAX} draws",
-        task.name
-    )))
+    Err(Fault::Wrong(format!("task {}, seed {seed}: no free layout in {DRAWS_MAX} draws", task.id)))
+}
+
+fn draw_distractors(
+    task: &Task,
+    layout: &Layout,
+    generator: &mut SplitMix64,
+    seed: u64,
+) -> Result<Vec<Pose>, Fault> {
+    let mut placed = vec![(layout.source_x, layout.source_y), (layout.target_x, layout.target_y)];
+    let mut poses = Vec::new();
+    for distractor in &task.rule.distractors {
+        let mut draw = || Pose {
+            x: generator.uniform(distractor.x),
+            y: generator.uniform(distractor.y),
+            yaw: generator.uniform(distractor.yaw),
+        };
+        let is_free = |pose: &Pose| {
+            let clear = |&(x, y)| distance(pose.x - x, pose.y - y) >= distractor.separation_min;
+            placed.iter().all(clear)
+        };
+        let pose = std::iter::repeat_with(&mut draw).take(DRAWS_MAX).find(is_free);
+        let pose = pose.ok_or_else(|| {
+            Fault::Wrong(format!(
+                "task {}, seed {seed}: no free place for the {} in {DRAWS_MAX} draws",
+                task.id, distractor.body
+            ))
+        })?;
+        placed.push((pose.x, pose.y));
+        poses.push(pose);
+    }
+    Ok(poses)
 }
 
 /// Whether source, target and yaw are all within the excluded distance of one layout.

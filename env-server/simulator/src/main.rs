@@ -4,7 +4,7 @@
 //! serving     the network, and how it ends       trace     every number of an episode, to be compared
 //!   server    leases, queue, heartbeat           session   numbered requests, slots
 //!   worlds    idle worlds                        world     one task in MuJoCo: reset, step, save, restore
-//!     model, controller, success, expert, layout, camera          tasks   assets/tasks.toml
+//!     mjcf, model, controller, success, expert, layout, camera    tasks   assets/tasks.toml
 //! ```
 
 mod camera;
@@ -12,6 +12,7 @@ mod controller;
 mod expert;
 mod fault;
 mod layout;
+mod mjcf;
 mod model;
 mod server;
 mod serving;

@@ -1,10 +1,11 @@
-//! A scene as MuJoCo loaded it, and the numbers of what tasks.toml names in it.
+//! A scene as MuJoCo compiled it, and the numbers of what tasks.toml names in it.
 
 use std::sync::Arc;
 
 use mujoco_rs::prelude::*;
 
 use crate::fault::Fault;
+use crate::mjcf;
 use crate::tasks::Task;
 
 /// Metres or newtons, world frame.
@@ -26,13 +27,16 @@ pub struct Names {
     /// Free joints of source and target; none where it does not move.
     pub source_joint: usize,
     pub target_joint: Option<usize>,
+    pub distractors: Vec<usize>,
+    pub distractor_joints: Vec<usize>,
 }
 
-/// Loads a task's scene.
-pub fn load(task: &Task) -> Result<(Arc<MjModel>, Names), Fault> {
-    let model = MjModel::from_xml(&task.scene).map_err(|error| {
-        Fault::Internal(format!("cannot load {}: {error}", task.scene.display()))
-    })?;
+/// Compiles a task's scene.
+pub fn compile(task: &Task) -> Result<(Arc<MjModel>, Names), Fault> {
+    let cannot =
+        |error: String| Fault::Internal(format!("cannot compile task {}: {error}", task.id));
+    let text = mjcf::scene(task).map_err(|error| cannot(format!("{error:#}")))?;
+    let model = MjModel::from_xml_string(&text).map_err(|error| cannot(error.to_string()))?;
     let timestep = model.opt().timestep;
     if timestep != task.settings.timestep {
         return Err(Fault::Internal(format!(
@@ -58,6 +62,7 @@ fn names(model: &MjModel, task: &Task) -> Result<Names, Fault> {
     let body = |name: &str| find(MjtObj::mjOBJ_BODY, name);
     let joint = |name: &str| find(MjtObj::mjOBJ_JOINT, name);
     let actuator = |name: &str| find(MjtObj::mjOBJ_ACTUATOR, name);
+    let distractors = task.rule.distractors.iter().map(|distractor| distractor.body.as_str());
     Ok(Names {
         source: body(&task.rule.source)?,
         target: body(&task.rule.target)?,
@@ -71,6 +76,8 @@ fn names(model: &MjModel, task: &Task) -> Result<Names, Fault> {
         finger_actuators: all(&settings.finger_joints, actuator)?,
         source_joint: joint(&task.rule.source)?,
         target_joint: task.rule.target_height.map(|_| joint(&task.rule.target)).transpose()?,
+        distractors: distractors.clone().map(body).collect::<Result<_, _>>()?,
+        distractor_joints: distractors.map(joint).collect::<Result<_, _>>()?,
     })
 }
 

@@ -191,8 +191,8 @@ impl<'a> Server<'a> {
 
     fn description(&self) -> Description {
         let tasks = self.worlds.tasks().iter().map(|task| TaskDescription {
-            task: task.name.clone(),
-            variant: task.rule.variant.clone(),
+            task: task.id.task.clone(),
+            variant: task.id.variant.clone(),
             version: task.rule.version,
             instruction: task.rule.instruction.clone(),
             steps_max: task.rule.steps_max,

@@ -14,7 +14,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use zenoh::Wait;
 
 use crate::server::{Server, ServerOptions};
-use crate::tasks::Task;
+use crate::tasks::{self, Task};
 use crate::worlds::Worlds;
 
 const PARENT_POLL: Duration = Duration::from_millis(500);
@@ -36,6 +36,9 @@ pub struct Arguments {
     /// Find others by multicast; without --listen, on every interface.
     #[arg(long)]
     multicast: bool,
+    /// Offer these alone: TASK, TASK/VARIANT, TASK/all; every task in every variant if left out.
+    #[arg(long, num_args = 1.., value_name = "TASK")]
+    tasks: Vec<String>,
     /// Who meets whom.
     #[arg(long, default_value = "local")]
     fleet: String,
@@ -57,6 +60,10 @@ pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
         *multicast || !connect.is_empty() || !listen.is_empty(),
         "expected --connect, --listen or --multicast, got none"
     );
+    let tasks = match arguments.tasks.as_slice() {
+        [] => tasks,
+        names => tasks::choose(tasks, names)?,
+    };
     let stop = Arc::new(AtomicBool::new(false));
     stop_on_signals(Arc::clone(&stop))?;
     let network = zenoh::open(configuration(&arguments)?)

@@ -15,6 +15,7 @@ pub struct Memory {
     /// Settled x and y of the source's origin, metres.
     source_origin: [f64; 2],
     target_origin: [f64; 2],
+    distractor_origins: Vec<[f64; 2]>,
     /// Settled half extents, rotated as SIMPLER does, metres.
     source_half: Vector,
     target_half: Vector,
@@ -59,6 +60,7 @@ impl Judge {
         Memory {
             source_origin: origin(source),
             target_origin: origin(target),
+            distractor_origins: self.names.distractors.iter().map(|&body| origin(body)).collect(),
             source_half: half_extents(&data.xquat()[source], &self.task.rule.source_extents),
             target_half: half_extents(&data.xquat()[target], &self.task.rule.target_extents),
             grasped_steps: 0,
@@ -80,7 +82,11 @@ impl Judge {
         // SIMPLER compares the settled origin with the current centre of mass here; the
         // offset between the two leaks into the source's displacement and is kept.
         let source_moved = moved(&data.xipos()[source], &memory.source_origin);
-        let target_moved = moved(&data.xpos()[target], &memory.target_origin);
+        let distractors = self.names.distractors.iter().zip(&memory.distractor_origins);
+        let other_moved = std::iter::once((&target, &memory.target_origin))
+            .chain(distractors)
+            .map(|(&body, origin)| moved(&data.xpos()[body], origin))
+            .fold(0.0, f64::max);
         let on_target = self.is_on_target(data, memory, &touch);
         memory.ever_success |= on_target;
         Statistics {
@@ -88,8 +94,8 @@ impl Judge {
             is_grasped,
             ever_grasped: memory.ever_grasped,
             consecutive_grasp: memory.consecutive_grasp,
-            moved_correct_object: source_moved > rule.moved_min && source_moved > target_moved,
-            moved_wrong_object: target_moved > rule.moved_min && target_moved > source_moved,
+            moved_correct_object: source_moved > rule.moved_min && source_moved > other_moved,
+            moved_wrong_object: other_moved > rule.moved_min && other_moved > source_moved,
             source_on_target: on_target,
             ever_success: memory.ever_success,
             released_success: on_target && !touch.robot && (touch.target || touch.elsewhere),

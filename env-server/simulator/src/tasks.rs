@@ -1,20 +1,33 @@
-//! The tasks: reads assets/tasks.toml, the one description for every simulator.
+//! The tasks and their variants: reads assets/tasks.toml, the one description for every simulator.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail, ensure};
 use protocol::Dimension;
 use serde::Deserialize;
-use toml::Spanned;
+use toml::{Table, Value};
 
 /// Numbers of an action: translation in metres, rotation vector in radians, gripper +1 open or -1 closed.
 pub const ACTION_LENGTH: usize = 7;
 /// Numbers of a state, in Bridge's order: x y z roll pitch yaw pad gripper.
 pub const STATE_LENGTH: usize = 8;
 
-/// Where source and target start: metres in the world frame, yaw in degrees.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+/// The variant of a task as its own table describes it.
+pub const DEFAULT: &str = "default";
+/// In place of a variant's or a task's name: every one of them.
+const ALL: &str = "all";
+
+/// A task in one of its variants. Its text is TASK, or TASK/VARIANT for another than the default one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TaskId {
+    pub task: String,
+    pub variant: String,
+}
+
+/// Where the objects start: metres in the world frame, yaw in degrees.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(from = "[f64; 5]")]
 pub struct Layout {
     pub source_x: f64,
@@ -22,7 +35,36 @@ pub struct Layout {
     pub source_yaw: f64,
     pub target_x: f64,
     pub target_y: f64,
+    pub distractors: Vec<Pose>,
 }
+
+/// Where a distractor starts: metres in the world frame, yaw in degrees.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(from = "[f64; 3]")]
+pub struct Pose {
+    pub x: f64,
+    pub y: f64,
+    pub yaw: f64,
+}
+
+/// An object that the task does not ask for: a body of the scene with a free joint of its name.
+///
+/// `x`, `y` and `yaw` bound random layouts, in which it keeps `separation_min` from every other object.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Distractor {
+    pub body: String,
+    pub height: f64,
+    pub x: [f64; 2],
+    pub y: [f64; 2],
+    pub yaw: [f64; 2],
+    pub separation_min: f64,
+    /// One for each layout of the grid.
+    pub layouts: Vec<Pose>,
+}
+
+/// What a task changes in its scene before it is compiled: element, its name, attribute, value.
+pub type MjcfChanges = BTreeMap<String, BTreeMap<String, BTreeMap<String, String>>>;
 
 /// The box random layouts are drawn from, and what is kept out of it.
 #[derive(Debug, Clone, Deserialize)]
@@ -83,7 +125,7 @@ pub struct GraspRule {
 /// One task in one variant, complete: nothing else decides what an episode is.
 #[derive(Debug, Clone)]
 pub struct Task {
-    pub name: String,
+    pub id: TaskId,
     pub scene: PathBuf,
     pub rule: TaskRule,
     pub state: Vec<Dimension>,
@@ -93,11 +135,10 @@ pub struct Task {
     pub grasp: GraspRule,
 }
 
-/// What stands under a task's name.
+/// What stands under a task's name, with a variant's fields in place of its own.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskRule {
-    pub variant: String,
     pub version: u32,
     /// Python's name for it; nobody asks for it here.
     #[serde(rename = "gymnasium_id")]
@@ -105,6 +146,8 @@ pub struct TaskRule {
     pub instruction: String,
     pub steps_max: u32,
     pub scene: String,
+    #[serde(default)]
+    pub mjcf: MjcfChanges,
     pub robot_joints: [f64; 8],
     pub source: String,
     pub target: String,
@@ -126,6 +169,8 @@ pub struct TaskRule {
     pub target_top: f64,
     pub hover: f64,
     pub release_gap: f64,
+    #[serde(default)]
+    pub distractors: Vec<Distractor>,
     pub random: RandomRanges,
     pub grid: Grid,
 }
@@ -145,7 +190,7 @@ struct File {
     world: WorldSettings,
     inverse_kinematics: InverseKinematics,
     grasp: GraspRule,
-    tasks: BTreeMap<String, Spanned<TaskRule>>,
+    tasks: Table,
 }
 
 #[derive(Deserialize)]
@@ -171,33 +216,140 @@ impl From<Bounds> for Dimension {
 
 impl From<[f64; 5]> for Layout {
     fn from([source_x, source_y, source_yaw, target_x, target_y]: [f64; 5]) -> Layout {
-        Layout { source_x, source_y, source_yaw, target_x, target_y }
+        Layout { source_x, source_y, source_yaw, target_x, target_y, distractors: Vec::new() }
     }
 }
 
-/// All tasks of a folder with tasks.toml and scenes, in the file's order; unknown or missing keys are errors.
+impl From<[f64; 3]> for Pose {
+    fn from([x, y, yaw]: [f64; 3]) -> Pose {
+        Pose { x, y, yaw }
+    }
+}
+
+impl TaskId {
+    /// TASK or TASK/VARIANT.
+    pub fn parse(text: &str) -> TaskId {
+        let (task, variant) = text.split_once('/').unwrap_or((text, DEFAULT));
+        TaskId { task: task.to_owned(), variant: variant.to_owned() }
+    }
+}
+
+impl fmt::Display for TaskId {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(&self.task)?;
+        if self.variant != DEFAULT {
+            write!(formatter, "/{}", self.variant)?;
+        }
+        Ok(())
+    }
+}
+
+/// All tasks of a folder with tasks.toml and scenes in all variants, in the file's order; unknown or missing keys are
+/// errors.
 pub fn load(assets: &Path) -> Result<Vec<Task>> {
     let path = assets.join("tasks.toml");
     let text = std::fs::read_to_string(&path)
         .with_context(|| format!("cannot read {}", path.display()))?;
-    let file: File =
-        toml::from_str(&text).with_context(|| format!("cannot read {}", path.display()))?;
-    let File { state, action, world, inverse_kinematics, grasp, tasks } = file;
-    let (state, action) = (state.map(Dimension::from), action.map(Dimension::from));
-    let mut tasks: Vec<(String, Spanned<TaskRule>)> = tasks.into_iter().collect();
-    tasks.sort_by_key(|(_, rule)| rule.span().start);
-    let task = |(name, rule): (String, Spanned<TaskRule>)| {
-        let rule = rule.into_inner();
-        Task {
-            name,
-            scene: assets.join(&rule.scene),
-            rule,
-            state: state.to_vec(),
-            action: action.to_vec(),
-            settings: world.clone(),
-            inverse_kinematics: inverse_kinematics.clone(),
-            grasp: grasp.clone(),
-        }
+    read(&text, assets).with_context(|| format!("cannot read {}", path.display()))
+}
+
+/// The named tasks in the file's order: TASK, TASK/VARIANT, TASK/all, or all.
+pub fn choose(tasks: Vec<Task>, names: &[String]) -> Result<Vec<Task>> {
+    let matches = |name: &str, task: &Task| {
+        let wanted = TaskId::parse(if name == ALL { "all/all" } else { name });
+        [(&wanted.task, &task.id.task), (&wanted.variant, &task.id.variant)]
+            .into_iter()
+            .all(|(wanted, got)| wanted == ALL || wanted == got)
     };
-    Ok(tasks.into_iter().map(task).collect())
+    for name in names {
+        if !tasks.iter().any(|task| matches(name, task)) {
+            let known: Vec<String> = tasks.iter().map(|task| task.id.to_string()).collect();
+            bail!("task {name}: expected one of {}", known.join(", "));
+        }
+    }
+    let is_chosen = |task: &Task| names.iter().any(|name| matches(name, task));
+    Ok(tasks.into_iter().filter(is_chosen).collect())
+}
+
+fn read(text: &str, assets: &Path) -> Result<Vec<Task>> {
+    let File { state, action, world, inverse_kinematics, grasp, tasks } = toml::from_str(text)?;
+    let (state, action) = (state.map(Dimension::from), action.map(Dimension::from));
+    let mut read = Vec::new();
+    for (name, table) in tasks {
+        let place = format!("tasks.{name}");
+        let Value::Table(mut own) = table else { bail!("{place}: expected a table, got {table}") };
+        let variants = match own.remove("variants") {
+            None => Table::new(),
+            Some(Value::Table(variants)) => variants,
+            Some(other) => bail!("{place}.variants: expected a table, got {other}"),
+        };
+        ensure!(
+            !variants.contains_key(DEFAULT),
+            "{place}.variants.{DEFAULT}: expected it in the task's own table"
+        );
+        let default = (DEFAULT.to_owned(), Value::Table(Table::new()));
+        for (variant, changes) in std::iter::once(default).chain(variants) {
+            let place = match variant.as_str() {
+                DEFAULT => place.clone(),
+                variant => format!("{place}.variants.{variant}"),
+            };
+            let mut table = Value::Table(own.clone());
+            merge(&place, &mut table, changes)?;
+            let mut rule = TaskRule::deserialize(table).with_context(|| place.clone())?;
+            rule.place_distractors().with_context(|| place)?;
+            read.push(Task {
+                id: TaskId { task: name.clone(), variant },
+                scene: assets.join(&rule.scene),
+                rule,
+                state: state.to_vec(),
+                action: action.to_vec(),
+                settings: world.clone(),
+                inverse_kinematics: inverse_kinematics.clone(),
+                grasp: grasp.clone(),
+            });
+        }
+    }
+    Ok(read)
+}
+
+/// Puts a variant's values in place of its task's, key by key in tables.
+fn merge(place: &str, own: &mut Value, changes: Value) -> Result<()> {
+    match (own, changes) {
+        (Value::Table(own), Value::Table(changes)) => {
+            for (key, value) in changes {
+                match own.get_mut(&key) {
+                    Some(current) => merge(&format!("{place}.{key}"), current, value)?,
+                    None => _ = own.insert(key, value),
+                }
+            }
+        }
+        (own, changes) => {
+            ensure!(
+                !own.is_table() && !changes.is_table(),
+                "{place}: expected a {}, got a {}",
+                own.type_str(),
+                changes.type_str()
+            );
+            *own = changes;
+        }
+    }
+    Ok(())
+}
+
+impl TaskRule {
+    /// Adds the distractors to the layouts of the grid.
+    fn place_distractors(&mut self) -> Result<()> {
+        let count = self.grid.layouts.len();
+        for (index, Distractor { layouts, .. }) in self.distractors.iter().enumerate() {
+            ensure!(
+                layouts.len() == count,
+                "distractors[{index}].layouts: expected {count} rows, one per layout, got {}",
+                layouts.len()
+            );
+            for (layout, pose) in self.grid.layouts.iter_mut().zip(layouts) {
+                layout.distractors.push(*pose);
+            }
+        }
+        Ok(())
+    }
 }

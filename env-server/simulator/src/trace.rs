@@ -1,4 +1,4 @@
-//! The trace subcommand: every number of an episode, so that two simulators can be held beside one another.
+//! The trace subcommand: every number of episodes, to compare two simulators.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -9,20 +9,21 @@ use protocol::{Observation, Statistics};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use crate::tasks::{ACTION_LENGTH, Task};
+use crate::tasks::{self, ACTION_LENGTH, Task};
 use crate::world::World;
 
-/// Print every number of an episode: one JSON object for the reset and one for each step
+/// Print every number of episodes: one JSON object for each reset and each step
 #[derive(Debug, Args)]
 #[group(skip)]
 pub struct Arguments {
-    #[arg(long)]
-    task: String,
-    /// Drawn from the seed if left out.
-    #[arg(long)]
-    layout: Option<u32>,
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
+    /// TASK, TASK/VARIANT, TASK/all, or all.
+    #[arg(long, num_args = 1.., required = true, value_name = "TASK")]
+    tasks: Vec<String>,
+    /// Drawn from the seeds if left out.
+    #[arg(long, num_args = 1..)]
+    layouts: Vec<u32>,
+    #[arg(long, num_args = 1.., default_values_t = [0])]
+    seeds: Vec<u64>,
     /// Height and width of the image.
     #[arg(long, default_value_t = 128)]
     side: u32,
@@ -33,7 +34,9 @@ pub struct Arguments {
 
 /// Floats stand as their bits, 16 (or 8) hexadecimal digits.
 #[derive(Serialize)]
-struct Line {
+struct Line<'a> {
+    episode: &'a str,
+    step: u32,
     qpos: Vec<String>,
     qvel: Vec<String>,
     state: Vec<String>,
@@ -44,24 +47,42 @@ struct Line {
 
 type Action = [f32; ACTION_LENGTH];
 
-/// Runs an episode to its horizon or the actions' end.
+/// Runs each episode to its horizon or the actions' end.
 pub fn trace(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
-    let task = tasks.into_iter().find(|task| task.name == arguments.task);
-    let task = task.with_context(|| format!("there is no task {}", arguments.task))?;
-    let mut actions = arguments.actions.map(read).transpose()?.map(Vec::into_iter);
-    let mut world = World::new(&Arc::new(task), arguments.side, arguments.side)?;
-    let observation = world.reset(arguments.layout, arguments.seed)?;
-    print(&world, &observation, None)?;
+    let Arguments { layouts, seeds, side, .. } = arguments;
+    let actions = arguments.actions.map(read).transpose()?;
+    let layouts = match layouts.as_slice() {
+        [] => vec![None],
+        layouts => layouts.iter().copied().map(Some).collect(),
+    };
+    for task in tasks::choose(tasks, &arguments.tasks)? {
+        let task = Arc::new(task);
+        let mut world = World::new(&task, side, side)?;
+        for &layout in &layouts {
+            for &seed in &seeds {
+                let words = layout.map_or("random".to_owned(), |layout| layout.to_string());
+                let name = format!("{}, layout {words}, seed {seed}", task.id);
+                let observation = world.reset(layout, seed)?;
+                print(&name, &world, &observation, None)?;
+                run(&name, &mut world, actions.as_deref())?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn run(name: &str, world: &mut World, actions: Option<&[Action]>) -> Result<()> {
+    let mut actions = actions.map(<[Action]>::iter);
     loop {
         let action = match &mut actions {
             None => world.expert_action()?,
             Some(actions) => match actions.next() {
-                Some(action) => action,
+                Some(action) => *action,
                 None => return Ok(()),
             },
         };
         let transition = world.step(&action)?;
-        print(&world, &transition.observation, Some(transition.statistics))?;
+        print(name, world, &transition.observation, Some(transition.statistics))?;
         if transition.truncated {
             return Ok(());
         }
@@ -81,13 +102,20 @@ fn read(file: PathBuf) -> Result<Vec<Action>> {
     text.lines().map(action).collect()
 }
 
-fn print(world: &World, seen: &Observation, statistics: Option<Statistics>) -> Result<()> {
+fn print(
+    episode: &str,
+    world: &World,
+    seen: &Observation,
+    statistics: Option<Statistics>,
+) -> Result<()> {
     let (positions, velocities) = world.joints();
     let wide = |numbers: &[f64]| numbers.iter().map(|number| bits(number.to_bits(), 16)).collect();
     let narrow =
         |numbers: &[f32]| numbers.iter().map(|number| bits(number.to_bits().into(), 8)).collect();
     let digest = Sha256::digest(&seen.image.pixels);
     let line = Line {
+        episode,
+        step: world.steps()?,
         qpos: wide(positions),
         qvel: wide(velocities),
         state: narrow(&seen.state),

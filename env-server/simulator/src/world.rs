@@ -62,7 +62,7 @@ pub struct Snapshot {
 impl World {
     pub fn new(task: &Arc<Task>, image_height: u32, image_width: u32) -> Result<World, Fault> {
         silence_warnings();
-        let (model, names) = model::load(task)?;
+        let (model, names) = model::compile(task)?;
         let camera = Camera::new(&model, names.camera, image_height, image_width)?;
         Ok(World {
             controller: Controller::new(&model, &names, task),
@@ -141,6 +141,11 @@ impl World {
         Ok(expert::decide(&self.task.rule, &sight).map(|number| number as f32))
     }
 
+    /// Steps of this episode.
+    pub fn steps(&self) -> Result<u32, Fault> {
+        Ok(self.running()?.steps)
+    }
+
     /// Joint positions and velocities, for those who compare simulators.
     pub fn joints(&self) -> (&[f64], &[f64]) {
         (self.data.qpos(), self.data.qvel())
@@ -188,6 +193,10 @@ impl World {
         let mut rows = vec![(self.names.source_joint, source, layout.source_yaw)];
         if let (Some(joint), Some(height)) = (self.names.target_joint, rule.target_height) {
             rows.push((joint, [layout.target_x, layout.target_y, height], 0.0));
+        }
+        let distractors = self.names.distractor_joints.iter().zip(&rule.distractors);
+        for ((&joint, distractor), pose) in distractors.zip(&layout.distractors) {
+            rows.push((joint, [pose.x, pose.y, distractor.height], pose.yaw));
         }
         for (joint, [x, y, height], yaw) in rows {
             let start = self.data.model().jnt_qposadr()[joint] as usize;
@@ -304,7 +313,7 @@ impl World {
         Err(Fault::PhysicsDiverged(format!(
             "physics of {} at step {steps}: expected finite speeds up to {SPEED_MAX:?}, got \
              {speed:?} of degree of freedom {fastest} of joint {joint} with warnings [{}]",
-            self.task.name,
+            self.task.id,
             diverged.join(", ")
         )))
     }

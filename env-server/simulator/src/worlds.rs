@@ -40,9 +40,9 @@ impl Worlds {
 
     /// The task; refused when it is not offered.
     pub fn task(&self, name: &str, variant: &str) -> Result<&Arc<Task>, Fault> {
-        let wanted = |task: &&Arc<Task>| task.name == name && task.rule.variant == variant;
+        let wanted = |task: &&Arc<Task>| task.id.task == name && task.id.variant == variant;
         self.tasks.iter().find(wanted).ok_or_else(|| {
-            let words = |task: &Arc<Task>| format!("{} ({})", task.name, task.rule.variant);
+            let words = |task: &Arc<Task>| format!("{} ({})", task.id.task, task.id.variant);
             let offered: Vec<String> = self.tasks.iter().map(words).collect();
             Fault::Wrong(format!(
                 "expected one of the tasks {}, got {name} ({variant})",

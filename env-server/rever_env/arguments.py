@@ -1,0 +1,73 @@
+"""What users pass to environments, checked in one place for local and remote ones."""
+
+import operator
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rever_env.protocol import limits
+
+
+def layout_of(options: dict[str, Any] | None) -> int | None:
+    """The fixed initial layout that reset's options ask for; ValueError for any other option."""
+    options = options or {}
+    unknown = set(options) - {"layout"}
+    if unknown:
+        raise ValueError(f"reset options: expected only 'layout', got {sorted(unknown)}")
+    layout = options.get("layout")
+    if layout is None:
+        return None
+    return _whole("reset options: layout", layout, (1 << 32) - 1)
+
+
+def seed_of(seed: Any) -> int | None:
+    """The seed as a Python integer, of numpy's integers too; ValueError beyond the protocol's."""
+    return None if seed is None else _whole("seed", seed, limits.SEED_END - 1)
+
+
+def image_size(height: Any, width: Any) -> tuple[int, int]:
+    """Height and width in pixels; both are 0 where no image is wanted."""
+    sides = (
+        _whole("image_height", height, limits.IMAGE_SIDE_MAX),
+        _whole("image_width", width, limits.IMAGE_SIDE_MAX),
+    )
+    if (sides[0] == 0) != (sides[1] == 0):
+        raise ValueError(
+            f"image size: expected both sides 0 (no image) or neither, got {sides[0]} x {sides[1]}"
+        )
+    return sides
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """ValueError for a mode that these environments do not have."""
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render mode: expected None or 'rgb_array', got {render_mode!r}")
+
+
+def action_numbers(space: spaces.Space[Any], action: Any) -> NDArray[np.float32]:
+    """The action as float32; ValueError for the wrong shape or numbers that are not finite.
+
+    Larger numbers than the space has are allowed: the environment decides what they do.
+    """
+    array = np.asarray(action)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"action: expected numbers, got {action!r}")
+    if array.shape != space.shape:
+        raise ValueError(f"action: expected shape {space.shape}, got {array.shape}")
+    with np.errstate(over="ignore"):  # what does not fit into 32 bits is infinite below
+        numbers = array.astype(np.float32)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"action: expected finite numbers, got {array.tolist()}")
+    return numbers
+
+
+def _whole(name: str, value: Any, largest: int) -> int:
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = -1
+    if isinstance(value, (bool, np.bool_)) or not 0 <= number <= largest:
+        raise ValueError(f"{name}: expected a whole number from 0 to {largest}, got {value!r}")
+    return number

@@ -1,0 +1,290 @@
+"""The way to environment servers: a zenoh session, who is found over it, and whether it is gone."""
+
+import contextlib
+import ctypes
+import os
+import re
+import time
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+
+from rever_env import endpoint, protocol
+from rever_env.serving import Endpoints
+from rever_env.tasks import TaskId
+
+_LOOK_SECS = 0.2  # between looks for a server
+_NOBODY_SECS = 2.0  # how long there may be no server at all
+_WAIT_SECS = 30.0  # for a server that is there to be free, or to answer
+_REACH_SECS = 5.0  # for one connection
+_RETURN_SECS = 2.0  # from a new connection to the server's token
+_SOURCE = re.compile(r"\s+at \S+\.rs:\d+\.?")  # where zenoh was built tells users nothing
+
+
+class RemoteFault(RuntimeError):
+    """The environment or the way to it broke: the episode has no outcome.
+
+    The next reset begins a new episode, over a new session if the old one is lost.
+    """
+
+
+class ForkedProcess(RemoteFault):
+    """The process was forked after zenoh had been opened, which zenoh does not survive."""
+
+
+class RemoteRefused(ValueError):
+    """The server refused a request; its environment is unchanged."""
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Which servers. connect: endpoints of servers or of a router, as tcp/HOST:PORT or HOST:PORT.
+
+    server: its id; without one, the server with most free sessions.
+    wait_secs: for a free session. None: 30 s, but 2 s where no server is found and none at all
+    after the first session, where connections are refused.
+    reply_secs: for a reply, including the time that a server is paused.
+    """
+
+    connect: tuple[str, ...]
+    fleet: str = "local"
+    server: str | None = None
+    wait_secs: float | None = None
+    reply_secs: float = 120.0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to open. task: None for the first that a server offers; or TASK, or TASK/VARIANT.
+
+    variant: None for the one that task names, "default" of TASK alone. Images of 0 x 0 pixels are
+    none.
+    """
+
+    task: str | None
+    variant: str | None
+    image_height: int
+    image_width: int
+    expert: bool
+
+    def among(self, tasks: Sequence[protocol.TaskDescription]) -> protocol.TaskDescription | None:
+        """The first of the tasks that is wanted."""
+        for one in tasks:
+            if self.variant is None:
+                if self.task in (None, str(TaskId(one.task, one.variant))):
+                    return one
+            elif self.task in (None, one.task) and self.variant == one.variant:
+                return one
+        return None
+
+    def __str__(self) -> str:
+        if self.task is None or self.variant is None:
+            return self.task or f"any task in variant {self.variant}"
+        return str(TaskId(self.task, self.variant))
+
+
+class Network:
+    """One zenoh session. It does not survive a fork, which is told at once.
+
+    is_return: a session was open here before, so that a refused connection is not waited for.
+    """
+
+    def __init__(self, fleet: Fleet, *, is_return: bool = False) -> None:
+        require_own_process()
+        self._fleet = Fleet(**{**vars(fleet), "connect": _checked(fleet.connect)})
+        self._keys = protocol.Keys(fleet.fleet)
+        self._process = os.getpid()
+        if fleet.wait_secs is not None:
+            reach_wait = wait = fleet.wait_secs
+        else:
+            reach_wait, wait = (0.0, _REACH_SECS) if is_return else (_NOBODY_SECS, _WAIT_SECS)
+        self._reach(reach_wait)
+        configuration = Endpoints(self._fleet.connect, (), multicast=False, wait_secs=wait)
+        _first_process.append(self._process)
+        try:
+            self.zenoh = zenoh.open(zenoh.Config.from_json5(configuration.configuration()))
+        except zenoh.ZError as error:
+            raise RemoteFault(
+                f"no zenoh server or router answered at {self.place} within {wait:g} s: "
+                f"{_SOURCE.sub('', str(error))}"
+            ) from None
+        self._is_routed = bool(self.zenoh.info.routers_zid())
+        self._declared: list[Any] = []
+        self._is_closed = False
+        self.is_absent = True  # no token of the server is seen (yet, or any more)
+        self._was_seen = False
+        self._connected_since: float | None = None  # while it is absent
+        self.restored_at = 0.0  # when the server's token came back, if it ever did
+        _open_networks.add(self)
+
+    @property
+    def place(self) -> str:
+        """Where the servers are, for messages."""
+        return ", ".join(self._fleet.connect)
+
+    @property
+    def is_own(self) -> bool:
+        """Whether this process opened it, and did not inherit it by a fork."""
+        return self._process == os.getpid()
+
+    def declare(self, declared: Any) -> Any:
+        """Keeps what is declared until close."""
+        self._declared.append(declared)
+        return declared
+
+    def close(self) -> None:
+        """Closes the session; does nothing in a forked process, whose parent still uses it."""
+        if self._is_closed or not self.is_own:
+            return
+        self._is_closed = True
+        for declared in reversed(self._declared):
+            with contextlib.suppress(zenoh.ZError):
+                declared.undeclare()
+        with contextlib.suppress(zenoh.ZError):
+            self.zenoh.close()  # type: ignore[no-untyped-call]
+
+    def find(self, wanted: "Wanted") -> protocol.Description:
+        """The named server, or of those that offer what is wanted the one with most free sessions.
+
+        RemoteRefused where servers are found and none offers it.
+        """
+        fleet = self._fleet
+        started = time.monotonic()
+        while True:
+            found, misread = self._described()
+            fitting = [server for server in found if wanted.among(server.tasks)]
+            free = [server for server in fitting if server.sessions < server.sessions_max]
+            if free:
+                return max(free, key=lambda server: server.sessions_max - server.sessions)
+            if found and not fitting:
+                offered = {
+                    TaskId(task.task, task.variant): 0 for one in found for task in one.tasks
+                }
+                raise RemoteRefused(
+                    f"expected one of the tasks {', '.join(map(str, offered))}, got {wanted}"
+                )
+            default = _WAIT_SECS if found else _NOBODY_SECS
+            wait = default if fleet.wait_secs is None else fleet.wait_secs
+            if time.monotonic() > started + wait:
+                named = f' with id "{fleet.server}"' if fleet.server else ""
+                raise RemoteFault(
+                    f"environment servers at {self.place}: all sessions are in use, and none was "
+                    f"free within {wait:g} s"
+                    if found
+                    else f"no environment server{named} found at {self.place} within {wait:g} s "
+                    f'(fleet "{fleet.fleet}"){misread}'
+                )
+            time.sleep(_LOOK_SECS)
+
+    def watch(self, server: str, wake: Callable[[], None]) -> None:
+        """Follows the server's liveliness token; wake: called when it is gone."""
+
+        def on_token(sample: Any) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                if self.is_absent and self._was_seen:
+                    self.restored_at = time.monotonic()
+                self.is_absent, self._was_seen = False, True
+            else:
+                self._connected_since = None
+                self.is_absent = True
+                wake()
+
+        self.declare(
+            self.zenoh.liveliness().declare_subscriber(
+                self._keys.server(server),
+                zenoh.handlers.Callback(on_token, indirect=False),
+                history=True,
+            )
+        )
+
+    def loss(self) -> str:
+        """What has become of the watched server, for messages; nothing while it may still answer.
+
+        One that is only paused may: for a while its connection stands, and then its endpoint still
+        accepts new ones.
+        """
+        if not self.is_absent:
+            return ""
+        info = self.zenoh.info
+        if not [*info.routers_zid(), *info.peers_zid()]:
+            self._connected_since = None
+            if self._accepts():
+                return ""
+            return "cannot be reached: the router is gone" if self._is_routed else "is gone"
+        now = time.monotonic()
+        if self._connected_since is None:
+            self._connected_since = now
+        return "is gone" if now > self._connected_since + _RETURN_SECS else ""
+
+    def _accepts(self) -> bool:
+        for one in self._fleet.connect:
+            with contextlib.suppress(endpoint.Unreachable):
+                endpoint.reach(one, _REACH_SECS)
+                return True
+        return False
+
+    def _reach(self, wait: float) -> None:
+        """Waits until an endpoint accepts connections, for zenoh itself does not say why not."""
+        deadline = time.monotonic() + wait
+        while True:
+            problems = []
+            for one in self._fleet.connect:
+                try:
+                    return endpoint.reach(one, min(_REACH_SECS, max(wait, _LOOK_SECS)))
+                except endpoint.Unreachable as error:
+                    problems.append(error)
+            if time.monotonic() > deadline or all(error.is_final for error in problems):
+                raise RemoteFault(
+                    f"cannot connect to {'; '.join(map(str, problems))}; is `python -m rever_env "
+                    f"serve --listen {self._fleet.connect[0]}` running?"
+                )
+            time.sleep(_LOOK_SECS)
+
+    def _described(self) -> tuple[list[protocol.Description], str]:
+        """Every server that answers, and why one that answers cannot be understood."""
+        fleet, misread = self._fleet, ""
+        key = self._keys.describe(fleet.server) if fleet.server else self._keys.describe_all()
+        found = []
+        timeout = _WAIT_SECS if fleet.wait_secs is None else max(fleet.wait_secs, _LOOK_SECS)
+        for reply in self.zenoh.get(key, timeout=timeout):
+            if reply.ok is not None:
+                try:
+                    found.append(protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes()))
+                except protocol.CodecError as error:  # of another version, for instance
+                    misread = f"; the description of one cannot be read: {error}"
+        return found, misread
+
+
+def require_own_process() -> None:
+    """ForkedProcess in a process that was forked after zenoh had been opened."""
+    if _first_process and _first_process[0] != os.getpid():
+        raise ForkedProcess(
+            f"remote environments do not work in a forked process: process {_first_process[0]} "
+            "had opened the network before the fork; start processes with "
+            "context='spawn' or 'forkserver'"
+        )
+
+
+def _checked(connect: Iterable[str]) -> tuple[str, ...]:
+    endpoints = tuple(endpoint.checked(one) for one in connect)
+    if not endpoints:
+        raise ValueError("connect: expected at least one endpoint, got none")
+    return endpoints
+
+
+_first_process: list[int] = []  # the process that opened zenoh first
+_open_networks: "weakref.WeakSet[Network]" = weakref.WeakSet()
+
+
+def _keep_inherited() -> None:
+    """In a forked process: zenoh's objects would wait for threads of the parent when freed."""
+    for network in _open_networks:
+        for inherited in (network.zenoh, *network._declared):
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(inherited))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_keep_inherited)

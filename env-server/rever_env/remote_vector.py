@@ -1,0 +1,311 @@
+"""Many environments that run in servers elsewhere, stepped at once as a Gymnasium vector."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+from numpy.typing import NDArray
+
+from rever_env.arguments import seed_of
+from rever_env.remote import Fields, RemoteEnv, RemoteFault, RemoteRefused
+
+# An attempt to reach a lost server holds all environments up: the next one comes after a time that
+# is longer than the attempt was by this factor.
+_RETRY_FACTOR = 4.0
+
+
+class RemoteVectorFault(RemoteFault):
+    """Some environments of a vector are lost, with their episodes; the others are not.
+
+    faults: what happened, by the environment's index.
+    results: what the call would have returned. Rows of the lost environments have their last
+    observation and the reward NaN, and infos["fault"] has the words.
+    """
+
+    def __init__(self, faults: dict[int, RemoteFault], results: tuple[Any, ...]) -> None:
+        words = "; ".join(f"environment {index}: {fault}" for index, fault in faults.items())
+        super().__init__(words)
+        self.faults = faults
+        self.results = results
+
+
+class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
+    """Sessions of many servers, stepped at once: every request is out before any reply is read.
+
+    connect: endpoints, each of a server or a router; environments are assigned to them in turn, by
+    default one to each. task, variant: one for all environments, or a sequence with one for each.
+    Other arguments as for RemoteEnv.
+    autoreset_mode: as in gymnasium.vector, as AutoresetMode or its text. NEXT_STEP: the step after
+    an episode's end begins the next one and ignores its action. SAME_STEP: the last step itself
+    does; the last observation and info are in info["final_obs"] and info["final_info"]. DISABLED:
+    reset with options={"reset_mask": bool (environments,)}.
+
+    A server that breaks costs its own environments only: RemoteVectorFault is raised with the
+    results of the others, and the vector goes on. While a server is away, every step raises it
+    anew. With NEXT_STEP and SAME_STEP each step also tries to begin a new episode in the lost
+    environments; with DISABLED, reset does.
+    """
+
+    def __init__(
+        self,
+        connect: str | Sequence[str],
+        num_envs: int | None = None,
+        *,
+        task: str | Sequence[str] | None = None,
+        variant: str | Sequence[str] | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **arguments: Any,
+    ) -> None:
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        endpoints = [connect] if isinstance(connect, str) else list(connect)
+        lists = [
+            list(one) for one in (task, variant) if one is not None and not isinstance(one, str)
+        ]
+        counts = [len(endpoints), *map(len, lists)]
+        self.num_envs = max(counts) if num_envs is None else num_envs
+        if not endpoints or self.num_envs < 1:
+            raise ValueError(
+                f"expected endpoints and environments, got {len(endpoints)} and {self.num_envs}"
+            )
+        self.envs: list[RemoteEnv] = []
+        try:
+            for index in range(self.num_envs):
+                self.envs.append(
+                    RemoteEnv(
+                        endpoints[index % len(endpoints)],
+                        self._of("task", task, index),
+                        self._of("variant", variant, index),
+                        **arguments,
+                    )
+                )
+            self._require_same_spaces()
+        except BaseException:
+            self.close_extras()
+            raise
+        first = self.envs[0]
+        self.render_mode = first.render_mode
+        self.metadata = {**first.metadata, "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = first.observation_space
+        self.single_action_space = first.action_space
+        self.observation_space = batch_space(first.observation_space, self.num_envs)
+        self.action_space = batch_space(first.action_space, self.num_envs)
+        self._ended = np.zeros(self.num_envs, np.bool_)
+        self._lost = np.zeros(self.num_envs, np.bool_)
+        self._endpoints = [endpoints[index % len(endpoints)] for index in range(self.num_envs)]
+        self._retry_at: dict[str, float] = {}  # by endpoint
+        empty: Any = create_empty_array(self.single_observation_space, 1, fn=np.zeros)
+        nothing = {name: value[0] for name, value in empty.items()}
+        self._latest: list[Fields] = [nothing] * self.num_envs
+
+    def reset(self, *, seed: Any = None, options: Fields | None = None) -> tuple[Fields, Fields]:
+        """seed: the first of consecutive ones, or a list with one or None for each environment."""
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, np.bool_)))
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+            raise ValueError(
+                f"reset_mask: expected bool ({self.num_envs},), got {mask.dtype} {mask.shape}"
+            )
+        seeds = self._seeds(seed)
+        call = _Call(self)
+        call.send(_indices(mask), lambda index: self._send_reset(index, seeds[index], options))
+        infos = self._received_resets(call, _indices(mask), {})
+        results = self._batch(), infos
+        call.finish(results)
+        return results
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[Fields, NDArray[Any], NDArray[Any], NDArray[Any], Fields]:
+        """actions: one for each environment. rewards float64, terminated and truncated bool."""
+        if len(actions) != self.num_envs:
+            raise ValueError(f"actions: expected {self.num_envs} of them, got {len(actions)}")
+        is_manual = self.autoreset_mode == AutoresetMode.DISABLED
+        if is_manual and self._ended.any():
+            ended = _indices(self._ended)
+            raise ValueError(f"environments {ended} have ended: expected reset with a reset_mask")
+        begins = _indices(self._ended | self._lost) if not is_manual else []
+        steps = _indices(~(self._ended | self._lost))
+        rows = list(iterate(self.action_space, actions))
+        for index in steps:
+            self._check(index, rows[index])  # before any of them moves
+        call = _Call(self)
+        if is_manual:
+            call.leave_out(_indices(self._lost))
+        call.send(begins, lambda index: self._send_reset(index, None))
+        call.send(steps, lambda index: self.envs[index].send_step(rows[index]))
+        rewards = np.zeros(self.num_envs, np.float64)
+        terminated, truncated = (np.zeros(self.num_envs, np.bool_) for _ in range(2))
+        step_infos: dict[int, Fields] = {}
+
+        def receive(index: int) -> None:
+            stepped = self.envs[index].receive_step()
+            self._latest[index], rewards[index] = stepped[0], stepped[1]
+            terminated[index], truncated[index], step_infos[index] = stepped[2:]
+
+        infos = self._received_resets(call, begins, {})
+        call.receive(steps, receive)
+        rewards[list(call.faults)] = np.nan
+        self._ended = terminated | truncated
+        infos = self._with_steps(call, step_infos, infos)
+        results = self._batch(), rewards, terminated, truncated, infos
+        call.finish(results)
+        return results
+
+    def render(self) -> tuple[Any, ...] | None:
+        """The last image of each environment."""
+        if self.render_mode is None:
+            return None
+        return tuple(env.render() for env in self.envs)
+
+    def call(self, name: str, *arguments: Any, **keywords: Any) -> tuple[Any, ...]:
+        """The attribute of each environment, called if it can be."""
+        values = self.get_attr(name)
+        return tuple(
+            value(*arguments, **keywords) if callable(value) else value for value in values
+        )
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """The attribute of each environment."""
+        return tuple(env.get_wrapper_attr(name) for env in self.envs)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """values: one for each environment as a list or tuple, or one for all."""
+        rows = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(rows) != self.num_envs:
+            raise ValueError(f"{name}: expected {self.num_envs} values, got {len(rows)}")
+        for env, value in zip(self.envs, rows, strict=True):
+            env.set_wrapper_attr(name, value)
+
+    def close_extras(self, **_arguments: Any) -> None:
+        """Closes the environments."""
+        for env in self.envs:
+            env.close()
+
+    def _with_steps(self, call: "_Call", step_infos: dict[int, Fields], infos: Fields) -> Fields:
+        """Adds the infos of steps; with SAME_STEP begins the next episodes of those that ended."""
+        is_same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
+        ended = _indices(self._ended) if is_same_step else []
+        for index, info in sorted(step_infos.items()):
+            if index in ended:
+                info = {"final_obs": self._latest[index], "final_info": info}
+            infos = self._add_info(infos, info, index)
+        self._ended[ended] = False
+        call.send(ended, lambda index: self._send_reset(index, None))
+        return self._received_resets(call, ended, infos)
+
+    def _received_resets(self, call: "_Call", indices: list[int], infos: Fields) -> Fields:
+        begun: dict[int, Fields] = {}
+
+        def receive(index: int) -> None:
+            self._latest[index], begun[index] = self.envs[index].receive_reset()
+
+        call.receive(indices, receive)
+        self._ended[list(begun)] = False
+        self._lost[list(begun)] = False
+        for index, info in begun.items():
+            infos = self._add_info(infos, info, index)
+        return infos
+
+    def _send_reset(self, index: int, seed: int | None, options: Fields | None = None) -> None:
+        env, endpoint = self.envs[index], self._endpoints[index]
+        if not env.session.is_lost:
+            env.send_reset(seed, options)
+            return
+        begun = time.monotonic()
+        if begun < self._retry_at.get(endpoint, 0.0):
+            raise RemoteFault(
+                f"{endpoint}: the server could not be reached and is tried again later"
+            )
+        try:
+            env.send_reset(seed, options)
+        except RemoteFault:
+            now = time.monotonic()
+            self._retry_at[endpoint] = now + _RETRY_FACTOR * (now - begun)
+            raise
+
+    def _check(self, index: int, action: Any) -> None:
+        try:
+            self.envs[index].checked(action)
+        except ValueError as error:
+            raise ValueError(f"environment {index}: {error}") from None
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        if seed is None or not np.iterable(seed):
+            first = seed_of(seed)
+            return [None if first is None else first + index for index in range(self.num_envs)]
+        seeds = [seed_of(one) for one in seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: expected {self.num_envs} seeds, got {len(seeds)}")
+        return seeds
+
+    def _of(self, name: str, value: str | Sequence[str] | None, index: int) -> str | None:
+        """What an argument is for one environment."""
+        if value is None or isinstance(value, str):
+            return value
+        if len(value) != self.num_envs:
+            raise ValueError(f"{name}: expected one or {self.num_envs}, got {len(value)}")
+        return value[index]
+
+    def _require_same_spaces(self) -> None:
+        first = self.envs[0]
+        for index, env in enumerate(self.envs):
+            for kind in ("observation_space", "action_space"):
+                expected, found = getattr(first, kind), getattr(env, kind)
+                if expected != found:
+                    raise ValueError(
+                        f"environment {index}, task {env.session.task.task}: {kind}: expected "
+                        f"{expected} as environment 0, got {found}"
+                    )
+
+    def _batch(self) -> Fields:
+        empty: Any = create_empty_array(self.single_observation_space, self.num_envs)
+        batched: Any = concatenate(self.single_observation_space, self._latest, empty)
+        fields: Fields = batched
+        return fields
+
+
+class _Call:
+    """One call of all environments: what fails in one keeps nobody from the others' replies."""
+
+    def __init__(self, vector: RemoteVectorEnv) -> None:
+        self._vector = vector
+        self.faults: dict[int, RemoteFault] = {}
+        self._refusals: dict[int, RemoteRefused] = {}
+
+    def send(self, indices: list[int], act: Callable[[int], None]) -> None:
+        """Does one half of a request for each environment of which nothing has failed yet."""
+        for index in indices:
+            if index in self.faults or index in self._refusals:
+                continue
+            try:
+                act(index)
+            except RemoteFault as fault:
+                self.faults[index] = fault
+                self._vector._lost[index] = True
+            except RemoteRefused as refusal:
+                self._refusals[index] = refusal
+
+    receive = send
+
+    def leave_out(self, indices: list[int]) -> None:
+        """Environments whose fault is already known."""
+        for index in indices:
+            self.faults[index] = RemoteFault("expected reset after a fault, got step")
+
+    def finish(self, results: tuple[Any, ...]) -> None:
+        """Raises what went wrong, with the results of the others in a fault."""
+        if self._refusals:
+            index, refusal = next(iter(self._refusals.items()))
+            raise RemoteRefused(f"environment {index}: {refusal}") from refusal
+        if self.faults:
+            infos = results[-1]
+            for index, fault in self.faults.items():
+                infos = self._vector._add_info(infos, {"fault": str(fault)}, index)
+            raise RemoteVectorFault(self.faults, (*results[:-1], infos))
+
+
+def _indices(mask: NDArray[np.bool_]) -> list[int]:
+    return [int(index) for index in np.flatnonzero(mask)]

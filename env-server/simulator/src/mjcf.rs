@@ -1,0 +1,76 @@
+//! A task's scene in MuJoCo's XML: its includes in place, and what the task changes in it.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use anyhow::{Context, Result, ensure};
+use xmltree::{Element, XMLNode};
+
+use crate::tasks::Task;
+
+/// The scene as one text, for MuJoCo's compiler.
+pub fn scene(task: &Task) -> Result<String> {
+    let mut root = included(&task.scene)?;
+    for (element, names) in &task.rule.mjcf {
+        for (name, attributes) in names {
+            let count = change(&mut root, None, (element, name), attributes);
+            ensure!(
+                count == 1,
+                "{}: expected one {element} named {name}, got {count}",
+                task.scene.display()
+            );
+        }
+    }
+    let mut text = Vec::new();
+    root.write(&mut text)?;
+    Ok(String::from_utf8(text)?)
+}
+
+/// Changes every element of that kind and name and counts them.
+///
+/// One without a name, as a body's inertial is, goes by its parent's.
+fn change(
+    node: &mut Element,
+    parent: Option<&str>,
+    (kind, name): (&str, &str),
+    attributes: &BTreeMap<String, String>,
+) -> usize {
+    let own = node.attributes.get("name").cloned();
+    let is_it = node.name == kind && own.as_deref().or(parent) == Some(name);
+    if is_it {
+        node.attributes.extend(attributes.clone());
+    }
+    let children = node.children.iter_mut().filter_map(XMLNode::as_mut_element);
+    let below = children.map(|child| change(child, own.as_deref(), (kind, name), attributes));
+    usize::from(is_it) + below.sum::<usize>()
+}
+
+fn included(path: &Path) -> Result<Element> {
+    let file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let mut root = Element::parse(BufReader::new(file))
+        .with_context(|| format!("cannot read {}", path.display()))?;
+    include(&mut root, path)?;
+    Ok(root)
+}
+
+/// Puts the content of other files in the place of include elements.
+fn include(node: &mut Element, path: &Path) -> Result<()> {
+    let mut children = Vec::new();
+    for child in std::mem::take(&mut node.children) {
+        match child {
+            XMLNode::Element(element) if element.name == "include" => {
+                let file = element.attributes.get("file").context("an include without a file")?;
+                children.extend(included(&path.with_file_name(file))?.children);
+            }
+            XMLNode::Element(mut element) => {
+                include(&mut element, path)?;
+                children.push(XMLNode::Element(element));
+            }
+            other => children.push(other),
+        }
+    }
+    node.children = children;
+    Ok(())
+}

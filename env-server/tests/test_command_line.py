@@ -1,0 +1,65 @@
+"""The command line says in one line what is wrong."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    """The package as a program."""
+    return subprocess.run(
+        [sys.executable, "-m", "rever_env", *arguments], capture_output=True, text=True, timeout=60
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (
+            "demonstrate --episodes 1 --out /proc/x",
+            1,
+            "error: cannot use /proc/x: No such file or directory",
+        ),
+        (
+            "trace --actions /nowhere/actions.txt",
+            1,
+            "error: cannot use /nowhere/actions.txt: No such file or directory",
+        ),
+        ("demonstrate --episodes 1 --out x --tasks cup", 1, "error: task cup: expected one of"),
+        (
+            "serve --listen tcp/127.0.0.1:0 --control-hz 5",
+            2,
+            "error: --control-hz has no effect without tasks of robosuite's own",
+        ),
+    ],
+)
+def test_an_error_is_one_line(arguments: str, status: int, words: str) -> None:
+    done = run(*arguments.split())
+    assert done.returncode == status
+    assert done.stderr.startswith(words), done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("demonstrate --episodes 0 --out x", "--episodes: expected a whole number from 1, got 0"),
+        ("expert --processes -1", "--processes: expected a whole number from 1, got -1"),
+        ("serve --arguments notjson", "--arguments: expected a JSON object, got notjson"),
+        ("", "the following arguments are required: COMMAND"),
+    ],
+)
+def test_wrong_usage_exits_with_2(arguments: str, words: str) -> None:
+    done = run(*arguments.split())
+    assert done.returncode == 2
+    assert words in done.stderr
+
+
+def test_a_folder_that_is_a_file_is_said(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    done = run("demonstrate", "--episodes", "1", "--out", str(tmp_path / "taken"))
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"error: cannot use {tmp_path}/taken/"), done.stderr
+    assert "Not a directory" in done.stderr

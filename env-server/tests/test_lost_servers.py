@@ -1,0 +1,158 @@
+"""Servers that are killed, paused or started again, and processes that fork."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import end, free_endpoint, serve, served
+
+import rever_env
+from rever_env import RemoteFault
+
+STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
+SMALL: dict[str, Any] = {"image_height": 8, "image_width": 8}
+
+
+def test_a_killed_server_is_named_and_found_again_by_reset() -> None:
+    endpoint = free_endpoint()
+    process = serve(endpoint)
+    remote = rever_env.RemoteEnv(endpoint, "widowx_stack_cube", **SMALL)
+    first, _ = remote.reset(seed=0)
+    server = remote.session.server
+    end(process)
+    begun = time.monotonic()
+    with pytest.raises(RemoteFault, match=f"server {server} at {endpoint} is gone"):
+        remote.step(STILL)
+    assert time.monotonic() - begun < 5.0
+    with pytest.raises(RemoteFault, match="the session is lost, and reset opens a new one"):
+        remote.step(STILL)
+    with pytest.raises(RemoteFault, match="connection refused; is `python -m rever_env serve"):
+        remote.reset(seed=0)
+    process = serve(endpoint)
+    try:
+        again, _ = remote.reset(seed=0)
+        assert np.array_equal(again["image"], first["image"])
+        assert remote.session.server != server
+        remote.step(STILL)
+        remote.close()
+    finally:
+        end(process)
+
+
+def test_reset_waits_for_a_server_as_long_as_it_is_told() -> None:
+    endpoint = free_endpoint()
+    process = serve(endpoint)
+    remote = rever_env.RemoteEnv(endpoint, **SMALL, wait_secs=60.0)
+    end(process)
+    restarted: list[Any] = []
+    thread = threading.Thread(target=lambda: restarted.append(serve(endpoint)))
+    thread.start()
+    try:
+        with pytest.raises(RemoteFault, match="is gone"):
+            remote.reset(seed=0)
+        remote.reset(seed=0)
+        remote.close()
+    finally:
+        thread.join()
+        end(restarted[0])
+
+
+def test_a_server_with_another_task_does_not_take_a_lost_ones_place() -> None:
+    endpoint = free_endpoint()
+    process = serve(endpoint)
+    remote = rever_env.RemoteEnv(endpoint, **SMALL)
+    end(process)
+    with pytest.raises(RemoteFault, match="is gone"):
+        remote.reset(seed=0)
+    process = serve(endpoint, "--gymnasium", "CartPole-v1")
+    try:
+        with pytest.raises(ValueError, match="tasks CartPole-v1, got widowx_spoon_on_towel"):
+            remote.reset(seed=0)
+        remote.close()
+    finally:
+        end(process)
+
+
+def test_a_paused_server_is_waited_for() -> None:
+    """Longer than requests are sent again after, and the server looked for."""
+    with served() as (endpoint, process):
+        remote = rever_env.RemoteEnv(endpoint, **SMALL)
+        remote.reset(seed=0)
+        os.kill(process.pid, signal.SIGSTOP)
+        timer = threading.Timer(4.0, os.kill, (process.pid, signal.SIGCONT))
+        timer.start()
+        remote.step(STILL)
+        timer.join()
+        remote.close()
+
+
+def test_a_server_that_does_not_answer_in_time_is_told_apart_from_one_that_is_gone() -> None:
+    with served() as (endpoint, process):
+        remote = rever_env.RemoteEnv(endpoint, **SMALL, reply_secs=2.0)
+        remote.reset(seed=0)
+        os.kill(process.pid, signal.SIGSTOP)
+        begun = time.monotonic()
+        with pytest.raises(RemoteFault, match=rf"at {endpoint} did not answer for 2 s"):
+            remote.step(STILL)
+        assert 2.0 <= time.monotonic() - begun < 4.0
+        os.kill(process.pid, signal.SIGCONT)
+        remote.reset(seed=0)
+        remote.step(STILL)
+        remote.close()
+
+
+def test_a_stopped_server_does_not_hold_up_close() -> None:
+    with served() as (endpoint, process):
+        remote = rever_env.RemoteEnv(endpoint, **SMALL)
+        os.kill(process.pid, signal.SIGSTOP)
+        begun = time.monotonic()
+        remote.close()
+        assert time.monotonic() - begun < 10.0
+
+
+FORKING = """
+import gymnasium, os, sys, rever_env
+environment = rever_env.RemoteEnv(sys.argv[1], image_height=8, image_width=8)
+environment.reset(seed=0)
+child = os.fork()
+if child == 0:
+    for act in (environment.reset, lambda: rever_env.RemoteEnv(sys.argv[1]).reset()):
+        try:
+            act()
+        except rever_env.RemoteFault as fault:
+            print("child:", fault)
+    environment.close()
+    del environment
+    sys.exit(7)
+print("child ended:", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+environment.step(environment.action_space.sample())  # the child closed nothing of ours
+environment.close()
+vector = gymnasium.make_vec(
+    "rever/Remote-v1", 2, "async", {"context": "fork"}, connect=sys.argv[1], task=sys.argv[2]
+)
+try:
+    vector.reset()
+except rever_env.RemoteFault as fault:
+    print("parent:", fault)
+"""
+
+
+def test_forked_environments_say_so_instead_of_hanging(endpoint: str) -> None:
+    said = subprocess.run(
+        [sys.executable, "-u", "-c", FORKING, endpoint, "widowx_stack_cube"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    words = "do not work in a forked process"
+    lines = said.stdout.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["child"] * 2 + ["child ended", "parent"]
+    assert all(words in line and "'forkserver'" in line for line in lines if "ended" not in line)
+    assert "child ended: 7" in lines, said.stderr
