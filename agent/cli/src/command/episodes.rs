@@ -280,6 +280,8 @@ fn load_scorer(policy: String) -> LoadScorer {
 fn results(folder: &Path) -> Result<(Results, Value)> {
     let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
     let mut provenance = serde_json::to_value(&header)?;
+    // Of the header's form, not of the result file's.
+    provenance.as_object_mut().map(|fields| fields.remove("version"));
     let simulator = summaries.first().map(|summary| summary.simulator.as_str());
     provenance["versions"]["simulator"] = json!(simulator);
     let tasks = tasks_in_order(&header.options);
