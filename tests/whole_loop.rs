@@ -69,8 +69,19 @@ fn every_episode_leaves_a_record_and_a_label() {
 #[test]
 fn the_result_file_has_the_documented_shape() {
     let (_, result) = undisturbed();
-    let parts =
-        ["decision_ms", "headroom", "paired", "rows", "simulator_ms", "step_ms", "versions"];
+    let parts = [
+        "batch_size",
+        "decision_ms",
+        "headroom",
+        "options",
+        "paired",
+        "rows",
+        "run",
+        "simulator_ms",
+        "starts",
+        "step_ms",
+        "versions",
+    ];
     assert_eq!(keys(result), parts);
     for time in ["decision_ms", "step_ms", "simulator_ms"] {
         assert_eq!(keys(&result[time]), ["p50", "p95"], "{time}");
@@ -84,7 +95,7 @@ fn the_result_file_has_the_documented_shape() {
         for key in ["task", "variant", "strategy"] {
             assert!(row[key].is_string(), "{key} in {row}");
         }
-        for key in ["candidates", "episodes", "faults"] {
+        for key in ["candidates", "episodes", "starts", "faults", "malformed", "held_steps"] {
             assert!(row[key].is_u64(), "{key} in {row}");
         }
         for key in ["grasp", "grasp_low", "grasp_high", "success", "success_low", "success_high"] {
@@ -96,7 +107,7 @@ fn the_result_file_has_the_documented_shape() {
     }
     let paired = result["paired"].as_array().expect("paired");
     let gain = paired.iter().find(|pair| pair["a"] == "verifier" && pair["b"] == "sample");
-    let gain = gain.expect("the verifier is compared with one sample");
+    let gain = gain.expect("the verifier is compared with a single sample");
     assert_eq!(gain["episodes"], TASKS.len());
     assert!(["gain", "low", "high"].iter().all(|key| gain[*key].is_f64()), "{gain}");
 }

@@ -291,6 +291,9 @@ mod tests {
         let wrong = Label { outcome: EpisodeOutcome { steps: 99, ..label(3).outcome }, ..label(3) };
         assert!(store.insert(&wrong).expect("first"));
         assert!(!store.insert(&label(3)).expect("second"));
+        let journal = |row: &Row<'_>| row.get::<_, String>(0);
+        let mode = store.connection.query_row("PRAGMA journal_mode", [], journal);
+        assert_eq!(mode.expect("a mode"), "delete", "a write-ahead log works on one host only");
         let elsewhere = Label { record: None, ..label(4) };
         assert!(store.insert(&elsewhere).expect("another"));
         assert_eq!(labels(&path).expect("labels"), [label(3), elsewhere]);

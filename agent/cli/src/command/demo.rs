@@ -71,7 +71,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     println!("{}", report::describe(&page));
     println!("done in {:.0} s", started.elapsed().as_secs_f64());
     if let Some(path) = &arguments.json {
-        ResultFile::new(&outcome.results, outcome.provenance.clone()).write(path)?;
+        ResultFile::new(&outcome.results, outcome.provenance.clone())?.write(path)?;
     }
     outcome.ending.ensure_complete(&outcome.folder)
 }

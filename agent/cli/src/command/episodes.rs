@@ -279,9 +279,11 @@ fn load_scorer(policy: String) -> LoadScorer {
 /// Results of all that is recorded in a run, and what they were made with.
 fn results(folder: &Path) -> Result<(Results, Value)> {
     let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
-    let mut provenance = header.versions.clone();
+    let mut provenance = serde_json::to_value(&header)?;
+    // Of the header's form, not of the result file's.
+    provenance.as_object_mut().map(|fields| fields.remove("version"));
     let simulator = summaries.first().map(|summary| summary.simulator.as_str());
-    provenance["simulator"] = json!(simulator);
+    provenance["versions"]["simulator"] = json!(simulator);
     let tasks = tasks_in_order(&header.options);
     Ok((Results::new(&summaries, &run::faults(folder)?, &tasks)?, provenance))
 }

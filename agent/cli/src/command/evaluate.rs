@@ -56,7 +56,7 @@ pub fn show(outcome: &Outcome, json: Option<&Path>) -> Result<()> {
     print!("{}", table::text(&outcome.results));
     println!("records: {}", outcome.folder.display());
     if let Some(path) = json {
-        ResultFile::new(&outcome.results, outcome.provenance.clone()).write(path)?;
+        ResultFile::new(&outcome.results, outcome.provenance.clone())?.write(path)?;
     }
     outcome.ending.ensure_complete(&outcome.folder)
 }

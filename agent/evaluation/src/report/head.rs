@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use serde_json::Value;
-use store::run::RunHeader;
+use store::run::{RunHeader, RunStart};
 
 use super::escape::html;
 use crate::headline::Headline;
@@ -12,11 +12,11 @@ use crate::results::{Counts, Results, StepTime};
 /// A digest is known by its beginning.
 const VERSION_LETTERS: usize = 16;
 
-/// Name, headline, facts, and all options and versions to unfold.
+/// Name, headline, facts, and all options, versions and command lines to unfold.
 pub fn head(header: &RunHeader, simulators: &BTreeSet<String>, results: &Results) -> String {
     format!(
         "<h1>{}</h1><p class=\"headline\">{}</p><dl class=\"facts\">{}</dl>\
-         <details><summary>options and versions</summary><dl class=\"facts\">{}</dl></details>",
+         <details><summary>options, versions and command lines</summary><dl class=\"facts\">{}</dl></details>",
         html(&header.run),
         headline(results),
         main_facts(header, simulators, results),
@@ -68,19 +68,14 @@ fn main_facts(header: &RunHeader, simulators: &BTreeSet<String>, results: &Resul
     facts.iter().map(|(name, value)| fact(name, value)).collect()
 }
 
-/// Everything that the header holds, options and versions one by one.
+/// Options and versions one by one, then the command lines and builds that made the run.
 fn all_facts(header: &RunHeader) -> String {
-    let Ok(Value::Object(fields)) = serde_json::to_value(header) else { return String::new() };
-    let mut facts = String::new();
-    for (name, value) in fields.iter().filter(|(name, _)| *name != "run") {
-        match value {
-            Value::Object(fields) => {
-                facts.extend(fields.iter().map(|(name, value)| fact_of(name, value)));
-            }
-            value => facts.push_str(&fact_of(name, value)),
-        }
-    }
-    facts
+    let objects = [&header.options, &header.versions].map(Value::as_object).into_iter().flatten();
+    let named = objects.flatten().map(|(name, value)| fact_of(name, value));
+    let starts = header.starts.iter().map(|RunStart { time, command, build }| {
+        fact(&format!("started {time}"), &format!("{} with {build}", command.join(" ")))
+    });
+    named.chain(starts).collect()
 }
 
 /// Nothing for an option that is not set.

@@ -3,7 +3,6 @@
 use std::collections::BTreeSet;
 
 use decision::{Strategy, TaskId};
-use serde_json::Value;
 use store::run::RunHeader;
 
 use super::bars::Bar;
@@ -34,7 +33,8 @@ pub fn page(
         ("verifier", "What the verifier’s scores mean", verifier(scored)),
         ("tasks", "Success per task", tasks(results)),
     ];
-    let rever = header.versions.get("rever").and_then(Value::as_str).unwrap_or("unknown");
+    let build =
+        header.starts.last().map_or_else(|| "rever".to_owned(), |start| start.build.to_string());
     let shown = || sections.iter().filter(|(_, _, body)| !body.is_empty());
     let links = shown().map(|(id, _, _)| format!("<a href=\"#{id}\">{id}</a>"));
     Page {
@@ -46,7 +46,7 @@ pub fn page(
                 format!("<section id=\"{id}\"><h2>{title}</h2>{body}</section>\n")
             })
             .collect(),
-        footer: format!("Made by rever {} from the records of the run.", html(rever)),
+        footer: format!("The episodes were run by {}.", html(&build)),
     }
 }
 

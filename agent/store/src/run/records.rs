@@ -12,6 +12,7 @@ use crate::labels::Label;
 use crate::record::{EpisodeRecord, ReadError};
 
 pub(super) const EPISODES: &str = "episodes";
+pub(super) const VIDEOS: &str = "videos";
 const RECORD_SUFFIX: &str = ".msgpack";
 /// Follows the name of a record that was set aside.
 const DAMAGED_SUFFIX: &str = ".damaged";
@@ -48,7 +49,7 @@ pub fn record_path(folder: &Path, id: &str) -> PathBuf {
 
 /// Where the video of an episode is, if there is one.
 pub fn video_path(folder: &Path, id: &str) -> PathBuf {
-    folder.join("videos").join(format!("{id}.mp4"))
+    folder.join(VIDEOS).join(format!("{id}.mp4"))
 }
 
 /// The names of all recorded episodes: what the folder holds, whatever the index says.
@@ -114,13 +115,19 @@ pub(super) fn check_all(folder: &Path, run: &str) -> Result<Vec<Entry>> {
 
 /// Removes what a killed process was writing.
 pub(super) fn remove_unfinished(folder: &Path) -> Result<()> {
-    for entry in std::fs::read_dir(folder.join(EPISODES))? {
-        let entry = entry?;
-        if entry.file_name().to_string_lossy().starts_with(TEMPORARY_PREFIX) {
-            let path = entry.path();
-            std::fs::remove_file(&path)
-                .with_context(|| format!("cannot remove {}", path.display()))?;
-        }
+    let folders = [folder.to_path_buf(), folder.join(EPISODES), folder.join(VIDEOS)];
+    for folder in folders.iter().filter(|folder| folder.exists()) {
+        let remove = || -> std::io::Result<()> {
+            for entry in std::fs::read_dir(folder)? {
+                let entry = entry?;
+                if entry.file_name().to_string_lossy().starts_with(TEMPORARY_PREFIX) {
+                    std::fs::remove_file(entry.path())?;
+                }
+            }
+            Ok(())
+        };
+        remove()
+            .with_context(|| format!("cannot remove unfinished files in {}", folder.display()))?;
     }
     Ok(())
 }

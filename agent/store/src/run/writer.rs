@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 use rusqlite::Connection;
 use serde_json::Value;
 
-use super::records::{self, EPISODES, Entry};
+use super::records::{self, EPISODES, Entry, VIDEOS};
 use super::{
     EpisodeSummary, FaultRecord, RunHeader, faults, header, index, record_path, video_path,
 };
@@ -62,6 +62,7 @@ impl Run {
         // Labels name records; they must be found from any working folder.
         let folder = std::path::absolute(&request.folder)
             .with_context(|| format!("cannot find the folder {name}"))?;
+        ensure!(folder.to_str().is_some(), "the run {name}: expected a path in UTF-8");
         let lock = lock(&folder)?;
         let header = header::settle(request, !records::recorded(&folder)?.is_empty())?;
         records::remove_unfinished(&folder)?;
@@ -109,7 +110,7 @@ impl Run {
     /// Keeps the video of an episode; before its record, so that a record's video is there.
     pub fn write_video(&self, id: &str, video: &[u8]) -> Result<()> {
         let path = video_path(&self.folder, id);
-        let folder = self.folder.join("videos");
+        let folder = self.folder.join(VIDEOS);
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot make {}", folder.display()))?;
         write_whole(&path, video)

@@ -41,7 +41,7 @@ fn mix(mut bits: u64) -> u64 {
     bits ^ (bits >> 31)
 }
 
-/// Draws a token from softmax(logits / temperature) at the quantile `uniform`.
+/// Draws a token from softmax(logits / temperature) at the share `uniform` of its cumulated weights.
 ///
 /// At temperature 0 it is the first of the largest logits. Weights are f32, their sums f64.
 pub fn draw(logits: &[f32], temperature: f32, uniform: f64) -> Result<Draw> {
@@ -57,7 +57,7 @@ pub fn draw(logits: &[f32], temperature: f32, uniform: f64) -> Result<Draw> {
         } else {
             soften_fast(logits, largest, 1.0 / temperature, &mut weights)
         };
-        quantile(&weights, uniform * total).unwrap_or(best)
+        index_at_sum(&weights, uniform * total).unwrap_or(best)
     };
     let log_probability = f64::from(logits[token] - largest) - natural.ln();
     Ok(Draw { token: token as u32, log_probability })
@@ -100,7 +100,7 @@ fn soften(logits: &[f32], largest: f32, scale: f32, weights: &mut [f32]) -> f64 
 }
 
 /// The first index at which the running sum exceeds `target`.
-fn quantile(weights: &[f32], target: f64) -> Option<usize> {
+fn index_at_sum(weights: &[f32], target: f64) -> Option<usize> {
     let mut sum = 0.0f64;
     weights.iter().position(|&weight| {
         sum += f64::from(weight);

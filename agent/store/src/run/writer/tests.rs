@@ -3,6 +3,7 @@
 use std::os::unix::fs::PermissionsExt;
 
 use serde_json::json;
+use sha2::{Digest, Sha256};
 
 use super::*;
 use crate::labels::{Label, labels};
@@ -174,18 +175,30 @@ fn a_reader_leaves_the_index_of_a_running_writer_alone() {
     }
     let index = run.folder.join(INDEX);
     let expected = run.summaries().expect("summaries");
-    // An index of a later build, a row that is damaged, and a record that cannot be read.
-    for sql in [
-        "PRAGMA user_version = 99",
-        "UPDATE episodes SET summary = replace(summary, 'true', 'false')",
-    ] {
+    // An index of another build, a row that was tampered with, and a row whose summary lacks a field.
+    let check = |change: &dyn Fn(&Connection)| {
         let other = Connection::open(&index).expect("an index");
-        other.execute_batch(sql).expect("tampered");
+        change(&other);
         drop(other);
         let before = std::fs::read(&index).expect("an index");
+        assert!(index::read(&run.folder).is_err(), "it is not used");
         assert_eq!(summaries(&run.folder).expect("from the records"), expected);
         assert_eq!(std::fs::read(&index).expect("an index"), before);
-    }
+    };
+    let whole = std::fs::read(&index).expect("an index");
+    check(&|index| index.execute_batch("PRAGMA user_version = 99").expect("changed"));
+    std::fs::write(&index, &whole).expect("as it was");
+    check(&|index| {
+        let sql = "UPDATE episodes SET summary = replace(summary, 'true', 'false')";
+        assert_eq!(index.execute(sql, []).expect("changed"), 3);
+    });
+    std::fs::write(&index, &whole).expect("as it was");
+    check(&|index| {
+        let text = r#"{"steps": 60}"#;
+        let sha256 = crate::digest::hex(&Sha256::digest(text));
+        let sql = "UPDATE episodes SET summary = ?1, sha256 = ?2";
+        assert_eq!(index.execute(sql, [text, &sha256]).expect("changed"), 3);
+    });
     std::fs::write(record_path(&run.folder, &expected[1].identity.id()), b"half").expect("damaged");
     assert_eq!(episodes(&summaries(&run.folder).expect("the others")), [0, 2]);
     // The writer goes on.
@@ -348,9 +361,12 @@ fn what_a_killed_process_left_unfinished_is_nothing() {
     };
     run.fault(&fault).expect("noted");
     let path = run.folder.clone();
+    run.write_video("a", b"a film").expect("written");
     drop(run);
-    let half = path.join(EPISODES).join(".tmpabc");
-    std::fs::write(&half, b"half").expect("written");
+    let unfinished = ["", EPISODES, VIDEOS].map(|folder| path.join(folder).join(".tmpabc"));
+    for half in &unfinished {
+        std::fs::write(half, b"half").expect("written");
+    }
     let append = |bytes: &[u8]| {
         let mut text = std::fs::read(path.join(FAULTS)).expect("faults");
         text.extend(bytes);
@@ -358,7 +374,8 @@ fn what_a_killed_process_left_unfinished_is_nothing() {
     };
     append(b"{\"identity\": {");
     let run = open(folder.path());
-    assert!(!half.exists());
+    assert!(!unfinished.iter().any(|half| half.exists()));
+    assert_eq!(std::fs::read(run.video_path("a")).expect("a video"), b"a film");
     assert_eq!(faults::faults(&path).expect("faults"), std::slice::from_ref(&fault));
     run.fault(&fault).expect("noted");
     drop(run);
