@@ -160,9 +160,9 @@ class _Blocks:
 
 def _robosuite(side: int) -> Block:
     """Steps of robosuite's Stack with a Panda, one camera and small random actions."""
-    import robosuite
+    from rever_env.robosuite_tasks import load_robosuite
 
-    environment: Any = robosuite.make(
+    environment: Any = load_robosuite().make(
         "Stack",
         robots="Panda",
         has_renderer=False,
@@ -178,6 +178,8 @@ def _robosuite(side: int) -> Block:
     low, high = environment.action_spec
 
     def block() -> list[float]:
+        # robosuite draws into the current context, which MuJoCo's renderer has changed.
+        environment.sim._render_context_offscreen.gl_ctx.make_current()
         seconds = []
         for _ in range(_BLOCK + 1):
             action = 0.2 * random.uniform(low, high)

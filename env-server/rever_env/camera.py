@@ -18,7 +18,7 @@ Image = NDArray[np.uint8]
 _GEOMS_MAX = 200
 _HIDDEN_GROUP = 5  # of shapes; MuJoCo draws the groups 0 to 2
 _HAS_EGL = sys.platform == "linux"
-_EDGE_MARGIN = 1e-3  # metres, for what is rounded on the way to a pixel
+_EDGE_MARGIN = 1e-3  # metres, for rounding errors of OpenGL
 
 
 class Camera:
@@ -45,14 +45,14 @@ class Camera:
                 renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
                 mujoco.mjr_resizeOffscreen(width, height, renderer)
                 mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
-        except Exception as error:  # the binding raises whatever its backend raises
+        except Exception as error:  # MuJoCo raises errors of several types
             raise RendererUnavailable(
                 f"renderer for {height} x {width} images: expected an offscreen OpenGL context, "
                 f"got {error}"
             ) from error
         self._context, self._renderer = context, renderer
         self._release = weakref.finalize(self, _release, context, renderer)
-        # A context goes with its process: MuJoCo may have closed the display before.
+        # Not at exit: the process frees it anyway, and MuJoCo may have closed the display before.
         self._release.atexit = False
         self._scene = mujoco.MjvScene(model, maxgeom=_GEOMS_MAX)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
@@ -62,7 +62,7 @@ class Camera:
         self._upwards = np.empty((height, width, 3), dtype=np.uint8)
         self._groups = model.geom_group.copy()
         self._edges = _edges(model, self._view.fixedcamid)
-        radii = model.geom_rbound[:, np.newaxis]  # (shapes, 1); 0: without end
+        radii = model.geom_rbound[:, np.newaxis]  # (shapes, 1); 0: infinite
         self._radii = np.where(radii > 0.0, radii + _EDGE_MARGIN, np.inf)
 
     def image(self, data: mujoco.MjData) -> Image:
@@ -146,7 +146,7 @@ class Camera:
 
 
 def _edges(model: mujoco.MjModel, camera: int) -> NDArray[np.float64]:
-    """Unit normals that point out of what the camera sees, (3, 5) in its frame.
+    """Unit normals of the planes of the view, pointing outwards, (3, 5) in the camera's frame.
 
     Right, left, top, bottom and behind; the camera looks along -z with y up.
     """

@@ -66,7 +66,7 @@ class Context:
 
 @contextmanager
 def preserved_context() -> Iterator[None]:
-    """For code that makes contexts of its own current: leaves this thread's as it was.
+    """Restores this thread's current context after code that makes contexts of its own current.
 
     A context that stays current in a thread cannot be used in another one.
     """
@@ -87,7 +87,7 @@ def preserved_context() -> Iterator[None]:
 
 
 def unavailable() -> str | None:
-    """Why no image can be rendered in this process, or None if one can."""
+    """The reason why this process cannot render images; None if it can."""
     try:
         Context().free()
     except RendererUnavailable as error:
@@ -96,7 +96,7 @@ def unavailable() -> str | None:
 
 
 def choose_device_for_other_libraries() -> None:
-    """Lets MuJoCo's, robosuite's and Gymnasium's renderers choose the same device as this module.
+    """Makes MuJoCo's, robosuite's and Gymnasium's renderers use the same device as this module.
 
     They read the environment when they are imported or first draw.
     """
@@ -106,9 +106,9 @@ def choose_device_for_other_libraries() -> None:
 
 
 def isolate_process() -> list[str]:
-    """Removes from this process's environment what would choose another renderer.
+    """Removes variables from this process's environment that would choose another renderer.
 
-    For processes of rever_env itself, before OpenGL is loaded; returns what deserves a warning.
+    For programs of rever_env, before OpenGL is loaded. Returns warnings for the user.
     """
     for name in (*_DRIVER_CHOICES, "MUJOCO_EGL_DEVICE_ID"):
         os.environ.pop(name, None)

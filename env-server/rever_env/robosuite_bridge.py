@@ -20,9 +20,9 @@ from rever_env.tasks import Layout, Task
 from rever_env.world import place_objects
 
 CAMERA = "robot0_third_person"
-# robosuite's names of the parts that the rules of a task speak of.
+# robosuite's prefixes for the parts that a task's rules refer to.
 _ROBOT_PREFIX, _GRIPPER_PREFIX = "robot0_", "gripper0_right_"
-# Metres and radians of a full command, per control step: the Bridge tasks' steps stay within.
+# Largest move of a control step in metres and radians; the Bridge tasks' actions stay below.
 _MOVE_MAX, _TURN_MAX = 0.1, 0.8
 _CONTROLLER = {
     "type": "BASIC",
@@ -97,12 +97,12 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         return float(self._check_success())
 
     def judged(self) -> Statistics:
-        """The episode's statistics; once per control step, for they have a memory."""
+        """The episode's statistics. Call it once per control step: they have a memory."""
         assert self.memory is not None, "an episode has begun"
         return self.judge.judge(self._data(), self.memory)
 
     def expert_decision(self) -> expert.Decision:
-        """The scripted expert's action float64 (7,) as in the Bridge tasks, and its reason."""
+        """The scripted expert's action, float64 (7,) as in our own worlds, and its reason."""
         assert self.memory is not None, "an episode has begun"
         stage = _Stage(self.sim.model._model, self._data(), self.task, self.judge, self.memory)
         return expert.decide(self.task, expert.look(stage))
@@ -144,11 +144,10 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         self.memory = self.judge.begin(data)
         (robot,) = self.robots
         if is_moved_by_pose(robot):
-            # As in SIMPLER.
             move_commanded_pose(robot)
 
     def _settle(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Lets the objects come to rest while the robot, which nobody controls yet, is held."""
+        """Lets the objects come to rest while the robot is held, as it has no control yet."""
         settings = self.task.settings
         joints = [model.joint(name) for name in settings.arm_joints + settings.finger_joints]
         positions = [joint.qposadr[0] for joint in joints]
@@ -164,7 +163,7 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
 
 
 def _environment(task: Task) -> str:
-    """The name of a task's class, which robosuite registers when it is made."""
+    """Defines the task's class, which registers it in robosuite; returns its name."""
     name = task.gymnasium_id.removeprefix("rever/").partition("-")[0]
     body = {"task_name": task.name, "__doc__": task.instruction}
     new_class(name, (BridgeTask,), exec_body=lambda namespace: namespace.update(body))
@@ -175,7 +174,7 @@ ENVIRONMENTS = {task.name: _environment(task) for task in tasks.choose(tasks.loa
 
 
 def _renamed(task: Task) -> Task:
-    """The task in robosuite's names."""
+    """The task with robosuite's names of bodies, joints, sites and camera."""
     settings = task.settings
 
     def of_gripper(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -25,12 +25,12 @@ from rever_env.fault import InvalidReset
 from rever_env.tasks import Task
 
 Element = ElementTree.Element
-_HAND = "gripper_bar_link"  # where the robot ends and its gripper begins
+_HAND = "gripper_bar_link"  # the first body of the gripper
 _UNSEEN = {"size": "0.002", "group": "4", "rgba": "0 0 0 0"}
 
 
 def bridge_arena(task: Task) -> Arena:
-    """Everything of a task's scene but the robot, objects included."""
+    """A task's scene with its objects and without the robot."""
     scene = _scene(task)
     robot = _base(scene)
     for change in task.mjcf:
@@ -45,7 +45,7 @@ def bridge_arena(task: Task) -> Arena:
 
 
 def fit_scene(model: Element, robot: ManipulatorModel, task: Task) -> None:
-    """Puts robot and camera where the task's scene has them, and lights it as the scene does."""
+    """Gives robot, camera and lights the poses and settings of the task's scene."""
     scene = _scene(task)
     base, root = _base(scene), robot.worldbody.find("body")
     root.attrib.update({name: base.attrib[name] for name in ("pos", "quat")})
@@ -144,12 +144,12 @@ def _any_task() -> Task:
 
 
 def _any_scene() -> Element:
-    """The robot is the same in every scene; where it stands is not: fit_scene."""
+    """The robot is the same in every scene, except for its pose: see fit_scene."""
     return _scene(_any_task())
 
 
 def _scene(task: Task) -> Element:
-    """A task's scene with what its default classes say at each element."""
+    """A task's scene with the values of its default classes written into each element."""
     scene = mjcf.scene(task)
     classes: dict[str, dict[str, dict[str, str]]] = {}
     for node in scene.findall("default"):
@@ -186,12 +186,12 @@ def _robot(scene: Element) -> Element:
     """From the base to the wrist, with a motor for each joint."""
     base = _base(scene)
     _without_gripper(base)
-    # robosuite's controllers make up for gravity themselves.
+    # robosuite's controllers compensate gravity themselves.
     for body in base.iter("body"):
         body.attrib.pop("gravcomp", None)
     for element in base.iter("joint"):
-        # robosuite gives friction to joints that do not say they have none, and nothing makes up
-        # for it: the arm would come to rest up to 8 % short of the commanded pose.
+        # robosuite adds damping and friction to joints without these attributes, and its controller
+        # does not compensate them: the arm would stop up to 8 % short of the commanded pose.
         element.attrib.update(damping="0", frictionloss="0")
     model = _model("widowx", scene, [base])
     actuator = ElementTree.SubElement(model, "actuator")
@@ -207,13 +207,13 @@ def _robot(scene: Element) -> Element:
             ctrllimited="true",
         )
     _name_geoms(base, "arm")
-    # What robosuite's controllers take for the arm's origin.
+    # robosuite's controllers use it as the origin of the arm's frame.
     ElementTree.SubElement(base, "site", _UNSEEN, name="right_center")
     return model
 
 
 def _gripper(scene: Element) -> Element:
-    """From the bar that carries the fingers on, with the fingers' own drives."""
+    """The bar that carries the fingers and everything below it, with the fingers' own drives."""
     hand = _without_gripper(_base(scene))
     for body in hand.iter("body"):
         body.attrib.pop("gravcomp", None)
@@ -244,7 +244,7 @@ def _gripper(scene: Element) -> Element:
 
 
 def _arena(scene: Element) -> Element:
-    """Everything but the robot."""
+    """Everything except the robot."""
     bodies = [node for node in _worldbody(scene) if node.get("name") != "base_link"]
     for index, body in enumerate(bodies):
         _name_geoms(body, f"arena_{index}")
@@ -276,7 +276,7 @@ def _base(scene: Element) -> Element:
 
 
 def _without_gripper(base: Element) -> Element:
-    """Puts robosuite's empty hand where the gripper begins, and returns what was there."""
+    """Replaces the gripper by robosuite's empty hand, and returns the gripper."""
     for parent in base.iter("body"):
         for index, child in enumerate(parent):
             if child.get("name") == _HAND:
@@ -288,7 +288,7 @@ def _without_gripper(base: Element) -> Element:
 
 
 def _name_geoms(root: Element, prefix: str) -> None:
-    """robosuite wants every geom named; its pictures leave group 0 out, where collisions belong."""
+    """Names every geom, as robosuite requires, and moves collision geoms to its hidden group 0."""
     geoms = [root] if root.tag == "geom" else list(root.iter("geom"))
     for index, geom in enumerate(geoms):
         geom.attrib.setdefault("name", f"{prefix}_{index}")

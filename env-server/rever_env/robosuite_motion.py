@@ -20,11 +20,12 @@ def is_moved_by_pose(robot: Any) -> bool:
 
 
 def move_commanded_pose(robot: Any) -> None:
-    """Lets actions move the commanded pose, which starts at the measured one; after each reset.
+    """Makes actions move the commanded pose, starting at the measured one. Call it after a reset.
 
-    Otherwise every action starts from the measured pose, and what the arm lags behind is lost: of
-    50 mm a Panda moves 12 at 20 Hz. robosuite 1.5.2 knows a mode for it, does not read the
-    controller's goal_update_mode, and a reset leaves a goal in the frame of the world.
+    By default each action starts from the measured pose, so that the arm's lag is lost: a Panda
+    commanded to move 50 mm at 20 Hz moves 12 mm. robosuite 1.5.2 has a mode for it, but ignores
+    goal_update_mode in a controller's configuration, and its reset leaves a goal in the world's
+    frame although the controller reads it in the base's.
     """
     robot.composite_controller.update_state()
     arm = robot.part_controllers[robot.arms[0]]

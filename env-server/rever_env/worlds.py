@@ -1,4 +1,4 @@
-"""The worlds of one process: made when first needed, handed from session to session, limited."""
+"""A pool of the worlds of one process: created on demand, reused by sessions, limited."""
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sized
@@ -15,7 +15,7 @@ Maker = Callable[[Any, int, int], "AnyWorld"]
 
 
 class OfferedTask(Protocol):
-    """What a server says of a task."""
+    """A task as a server describes it."""
 
     @property
     def name(self) -> str: ...
@@ -38,7 +38,7 @@ class OfferedTask(Protocol):
 
 
 class AnyWorld(Protocol):
-    """What a session needs of a world, whatever simulates it; its errors: rever_env.fault."""
+    """The interface between a session and any simulator. Errors: see rever_env.fault."""
 
     def reset(self, *, layout: int | None, seed: int) -> Observation:
         """The same arguments give the same bytes."""
@@ -57,11 +57,11 @@ class AnyWorld(Protocol):
         ...
 
     def expert_action(self) -> NDArray[np.float64]:
-        """What a scripted expert would do, if there is one."""
+        """The action of a scripted expert, if there is one."""
         ...
 
     def close(self) -> None:
-        """Frees what the world holds."""
+        """Frees the world's memory and contexts."""
         ...
 
 
@@ -70,11 +70,11 @@ class UnknownTask(ValueError):
 
 
 class Worlds:
-    """Not thread-safe: use it in the thread that renders.
+    """Not thread-safe.
 
-    A world carries nothing from one episode to the next, so it does not matter which one a session
-    gets. idle_max: worlds kept that no session uses; making one takes tens of milliseconds.
-    image_side_max: 0 when the worlds have no images.
+    Worlds keep nothing from one episode to the next, so sessions may share them in turn. idle_max:
+    unused worlds that are kept, since creating one takes tens of milliseconds. image_side_max: 0
+    when the worlds have no images.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Worlds:
         return task
 
     def take(self, key: Key) -> AnyWorld:
-        """A world for the caller alone. key: task, variant, image height, image width."""
+        """A world for the caller's exclusive use. key: task, variant, image height, image width."""
         for index, (idle_key, world) in enumerate(self._idle):
             if idle_key == key:
                 del self._idle[index]
@@ -110,7 +110,7 @@ class Worlds:
         return self._make(self.task(name, variant), height, width)
 
     def give_back(self, key: Key, world: AnyWorld) -> None:
-        """Keeps a sound world for the next taker; closes the one unused for longest if need be."""
+        """Keeps a world for reuse; closes the least recently used one beyond idle_max."""
         self._idle.append((key, world))
         if len(self._idle) > self._idle_max:
             self._idle.popleft()[1].close()

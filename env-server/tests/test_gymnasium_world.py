@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import gymnasium
@@ -115,7 +116,9 @@ def pair(request: pytest.FixtureRequest) -> Iterator[list[GymnasiumWorld]]:
         world.close()
 
 
-def test_resets_and_steps_give_the_same_bytes_in_any_world(pair: list[GymnasiumWorld]) -> None:
+def test_resets_and_steps_give_the_same_bytes_in_any_world_and_thread(
+    pair: list[GymnasiumWorld],
+) -> None:
     chosen = actions(pair[0], 6)
 
     def run(world: GymnasiumWorld, seed: int) -> list[Observation]:
@@ -124,7 +127,9 @@ def test_resets_and_steps_give_the_same_bytes_in_any_world(pair: list[GymnasiumW
 
     expected = run(pair[0], 3)
     run(pair[0], 1 << 40)
-    for again in (run(pair[0], 3), run(pair[1], 3)):
+    with ThreadPoolExecutor(1) as thread:
+        in_a_thread = thread.submit(run, pair[0], 3).result(timeout=120)
+    for again in (run(pair[0], 3), run(pair[1], 3), in_a_thread):
         assert all(same(*both) for both in zip(expected, again, strict=True))
     assert expected[0].image.shape == (24, 40, 3)
     assert expected[0].image.std() > 1.0

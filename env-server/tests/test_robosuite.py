@@ -2,6 +2,7 @@
 
 import gc
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -108,6 +109,15 @@ def test_a_world_that_is_closed_takes_no_other_worlds_pictures(
     del other
     gc.collect()
     assert all(same(*pair) for pair in zip(expected, run(first, 4), strict=True))
+
+
+def test_another_thread_gets_the_same_images(worlds: list[RobosuiteWorld]) -> None:
+    expected = run(worlds[0], 5)
+    with ThreadPoolExecutor(1) as thread:
+        for world in worlds[:2]:
+            again = thread.submit(run, world, 5).result(timeout=120)
+            assert all(same(*pair) for pair in zip(expected, again, strict=True))
+    assert all(same(*pair) for pair in zip(expected, run(worlds[0], 5), strict=True))
 
 
 def test_two_arms_take_robosuites_own_actions() -> None:

@@ -1,7 +1,7 @@
 //! The camera: RGB images from an offscreen OpenGL context without a window.
 
 use std::cell::OnceCell;
-use std::ffi::c_void;
+use std::ffi::{CStr, c_char, c_void};
 use std::rc::Rc;
 use std::sync::Arc;
 
@@ -23,6 +23,9 @@ const EDGE_MARGIN: f32 = 1e-3;
 /// Of EGL_EXT_platform_device: a display of a graphics device, without a window system.
 const PLATFORM_DEVICE: egl::Enum = 0x313F;
 const DEVICES_MAX: usize = 16;
+/// Of EGL_EXT_device_query: the extensions of a device, and the one of Mesa's software renderer.
+const EXTENSIONS: egl::Int = 0x3055;
+const SOFTWARE_DEVICE: &[u8] = b"EGL_MESA_device_software";
 
 /// One fixed camera; the model, not the image's shape, sets its field of view. With 0 x 0 pixels it
 /// renders nothing, and needs no OpenGL. Use it in the thread that made it.
@@ -44,7 +47,8 @@ struct Offscreen {
     context: egl::Context,
 }
 
-/// libEGL and the first display of a device that works; the same for all cameras of a thread.
+/// libEGL and the display of Mesa's software device, or else of the first device that works; the same for all cameras
+/// of a thread.
 struct Display {
     egl: Egl,
     display: egl::Display,
@@ -242,7 +246,9 @@ impl Display {
         // SAFETY: loading libEGL runs its initialisers, which is what it is for.
         let egl = unsafe { Egl::load_required() }
             .map_err(|error| format!("no libEGL.so.1 with EGL 1.5: {error}"))?;
-        let devices = devices(&egl)?;
+        let mut devices = devices(&egl)?;
+        // Images must not depend on the graphics card that a machine may have.
+        devices.sort_by_key(|device| !is_software(&egl, *device));
         let mut reason = "no device".to_owned();
         for device in devices {
             // SAFETY: the device was listed by this library.
@@ -274,4 +280,19 @@ fn devices(egl: &Egl) -> Result<Vec<*mut c_void>, String> {
     }
     devices.truncate(count as usize);
     Ok(devices)
+}
+
+fn is_software(egl: &Egl, device: *mut c_void) -> bool {
+    type QueryString = unsafe extern "system" fn(*mut c_void, egl::Int) -> *const c_char;
+    let Some(query) = egl.get_proc_address("eglQueryDeviceStringEXT") else { return false };
+    // SAFETY: EGL_EXT_device_query gives the function of this name this type.
+    let query: QueryString = unsafe { std::mem::transmute(query) };
+    // SAFETY: the device was listed by this library.
+    let extensions = unsafe { query(device, EXTENSIONS) };
+    if extensions.is_null() {
+        return false;
+    }
+    // SAFETY: EGL returns a text that ends with a zero and lives as long as the library.
+    let extensions = unsafe { CStr::from_ptr(extensions) };
+    extensions.to_bytes().split(|byte| *byte == b' ').any(|name| name == SOFTWARE_DEVICE)
 }
