@@ -1,88 +1,111 @@
 //! What a verifier file says about itself: for which policy, trained how and on what, and how good it is.
+//!
+//! The aliases are the names in files of the first format, which stay readable.
 
 use serde::{Deserialize, Serialize};
 
-use super::Metrics;
+use crate::Metrics;
+
+/// Numbers of an action in files of the first format, which do not say it.
+const ACTION_LENGTH_FIRST: usize = 7;
 
 /// Everything in a verifier file beside its weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Description {
+pub struct VerifierDescription {
     /// Digest of the policy whose hidden states it reads.
     pub policy: String,
     /// Length of a hidden state.
     pub input_size: usize,
+    /// Numbers of the policy's actions.
+    #[serde(default = "action_length_first")]
+    pub action_length: usize,
     /// How it was trained.
-    pub options: Options,
+    pub options: TrainingOptions,
     /// What it was trained on.
-    pub evidence: Evidence,
+    #[serde(alias = "evidence")]
+    pub data: TrainingData,
     /// How well its network separates successes from failures on the held-out episodes, by executed candidates.
     pub held_out: Metrics,
-    /// What its choice part was trained on; none when it has none.
-    #[serde(default)]
-    pub choice: Option<ChoiceEvidence>,
+    /// What its ranking was fitted to; none when it has no ranking.
+    #[serde(default, alias = "choice")]
+    pub ranking: Option<RankingEvidence>,
 }
 
-/// What the choice part was trained on, and what it is worth by the same episodes, cross-fitted.
+fn action_length_first() -> usize {
+    ACTION_LENGTH_FIRST
+}
+
+/// What the ranking was fitted to, and its cross-fitted gain: no model that an episode is judged with has seen an episode
+/// of its fold.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct ChoiceEvidence {
-    /// Sampled episodes whose decisions had several candidates.
+pub struct RankingEvidence {
+    /// Episodes whose decisions had several candidates.
     pub episodes: usize,
     /// Their decisions.
     pub decisions: usize,
-    /// Of choosing the best candidate, with an aim factor of 1: a larger one pays only over many decisions.
-    pub gain: Gain,
-    /// Of choosing the medoid, by the same measure.
-    pub medoid_gain: Gain,
+    /// Gain of the best-ranked candidate, with a target factor of 1: a larger one pays only over many decisions.
+    pub gain: ReRankingGain,
+    /// Gain of the medoid, by the same measure.
+    pub medoid_gain: ReRankingGain,
 }
 
-/// The sum, over an episode's decisions, of what choosing in that decision alone would change.
+/// Estimated gain from re-ranking single decisions: the sum, over an episode's decisions, of what choosing another
+/// candidate in that decision alone would change.
 ///
-/// It compares ways to choose on the same episodes. It is no forecast: changes of many decisions do not add up.
+/// It compares rankings on the same episodes. It is no forecast: changes of many decisions do not add up.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Gain {
+pub struct ReRankingGain {
     /// Percentage points of success, mean of the episodes.
-    pub points: f64,
-    /// Of that mean.
+    #[serde(alias = "points")]
+    pub percentage_points: f64,
+    /// Of that mean; episodes of one initial layout count as one cluster.
     pub standard_error: f64,
 }
 
 /// How a verifier is trained.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Options {
+pub struct TrainingOptions {
     /// Seed of the split, the first weights and the order of samples.
     pub seed: u64,
     /// Sizes of the two hidden layers.
     pub hidden_sizes: [usize; 2],
     /// Passes over the training samples at most.
     pub epochs_max: usize,
-    /// Passes without a better held-out loss after which training stops.
+    /// Passes without a better validation loss after which training stops.
     pub patience_epochs: usize,
-    /// Samples per step of the optimiser.
+    /// Samples per step of the optimizer.
     pub batch_samples: usize,
     /// Step size of AdamW.
     pub learning_rate: f64,
     /// Decoupled weight decay of AdamW.
     pub weight_decay: f64,
-    /// Share of the episodes of every task that are held out.
+    /// Share of the initial layouts of every task that decides when training stops. 0 in files of the first format,
+    /// whose training stopped by the loss on the held-out episodes.
+    #[serde(default)]
+    pub validation_share: f64,
+    /// Share of the initial layouts of every task that nothing is fitted to or chosen by.
     pub held_out_share: f64,
-    /// Whether to fit a choice part when there are episodes for it; without one this is the paper's verifier.
-    pub choice: bool,
-    /// Share of each later change of value that counts for an action's advantage, per control step: TD(lambda)'s lambda.
+    /// Whether to fit a ranking where there are episodes for it; without one this is the paper's verifier.
+    #[serde(alias = "choice")]
+    pub ranking: bool,
+    /// Share of each later change of value that counts for an action's advantage, per decision: TD(lambda)'s lambda.
     pub advantage_decay: f64,
-    /// Ridge of the choice part's regression, in units of a standardised feature's variance.
-    pub choice_ridge: f64,
+    /// Ridge of the ranking's regression, in units of a standardised feature's variance.
+    #[serde(alias = "choice_ridge")]
+    pub ranking_ridge: f64,
     /// What the weights of the nearness to the target are multiplied by. The regression sees what one decision does
     /// while all later ones drift on; a gripper that is led by every decision keeps what it has gained.
-    pub aim_factor: f64,
+    #[serde(alias = "aim_factor")]
+    pub target_factor: f64,
 }
 
-impl Default for Options {
-    fn default() -> Options {
-        Options {
+impl Default for TrainingOptions {
+    fn default() -> TrainingOptions {
+        TrainingOptions {
             seed: 0,
             hidden_sizes: [256, 64],
             epochs_max: 40,
@@ -90,25 +113,32 @@ impl Default for Options {
             batch_samples: 256,
             learning_rate: 3e-4,
             weight_decay: 1e-2,
+            validation_share: 0.1,
             held_out_share: 0.2,
-            choice: true,
+            ranking: true,
             advantage_decay: 0.95,
-            choice_ridge: 0.12,
-            aim_factor: 4.0,
+            ranking_ridge: 0.12,
+            target_factor: 4.0,
         }
     }
 }
 
 /// What a verifier was trained on.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Evidence {
-    /// Episodes that the weights were fitted to.
+#[serde(default, deny_unknown_fields)]
+pub struct TrainingData {
+    /// Episodes that the network was fitted to.
     pub training_episodes: usize,
     /// How many of them succeeded.
     pub training_successes: usize,
     /// Their control steps with a hidden state.
     pub training_samples: usize,
+    /// Episodes that decided when training stopped.
+    pub validation_episodes: usize,
+    /// How many of them succeeded.
+    pub validation_successes: usize,
+    /// Their control steps with a hidden state.
+    pub validation_samples: usize,
     /// Episodes held out.
     pub held_out_episodes: usize,
     /// How many of them succeeded.

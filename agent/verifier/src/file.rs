@@ -1,31 +1,45 @@
 //! The verifier's file: safetensors with the weights in f32 and the description as JSON in the metadata.
 
-use std::collections::HashMap;
+use std::borrow::Cow;
+use std::collections::{BTreeMap, HashMap};
 
 use anyhow::{Context, ensure};
+use decision::Stage;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 
-use super::{
-    TargetModel, Choice, Description, FEATURES, FILE_BYTES_MAX, Layer, Network, Place, Stage,
-    Standardisation, TERMS,
+use crate::verifier::FILE_BYTES_MAX;
+use crate::{
+    FeatureLayout, Layer, Network, Ranking, Standardisation, TERMS, TargetMap, TargetModel,
+    VerifierDescription,
 };
 
 /// Metadata key of the description; one key, because the order of several would not be the same twice.
 const DESCRIPTION_KEY: &str = "rever.verifier";
 const MEAN: &str = "standardisation.mean";
 const DEVIATION: &str = "standardisation.deviation";
-const CHOICE: &str = "choice.weight";
-/// Followed by the instruction.
-const AIMS: [(Stage, &str); 2] = [(Stage::Grasp, "aim.grasp."), (Stage::Place, "aim.place.")];
 const LAYERS: [&str; 3] = ["hidden_1", "hidden_2", "output"];
+const RANKING: &str = "ranking.weight";
+/// Followed by the instruction.
+const TARGETS: [(Stage, &str); 2] =
+    [(Stage::Grasp, "target.grasp."), (Stage::Place, "target.place.")];
+
+/// What a file holds.
+pub struct Contents {
+    /// Scores hidden states.
+    pub network: Network,
+    /// Tells candidates apart; none in the paper's verifier.
+    pub ranking: Option<Ranking>,
+    /// What it is.
+    pub description: VerifierDescription,
+}
 
 /// The bytes of a file: the same verifier always gives the same bytes.
 pub fn encode(
     network: &Network,
-    choice: Option<&Choice>,
-    description: &Description,
+    ranking: Option<&Ranking>,
+    description: &VerifierDescription,
 ) -> anyhow::Result<Vec<u8>> {
     let size = network.input_size();
     let Standardisation { mean, deviation } = network.standardisation();
@@ -38,11 +52,12 @@ pub fn encode(
         tensors.push((format!("{name}.weight"), shape, bytes_of(layer.weight())));
         tensors.push((format!("{name}.bias"), vec![layer.outputs()], bytes_of(layer.bias())));
     }
-    if let Some(choice) = choice {
-        tensors.push((CHOICE.to_owned(), vec![FEATURES], bytes_of(choice.weights())));
-        for (instruction, stage, place) in choice.target_model().places() {
-            let name = format!("{}{instruction}", AIMS[stage as usize].1);
-            let numbers = place.coefficients().as_flattened();
+    if let Some(ranking) = ranking {
+        let weights = ranking.weights();
+        tensors.push((RANKING.to_owned(), vec![weights.len()], bytes_of(weights)));
+        for (instruction, stage, map) in ranking.target_model().maps() {
+            let name = format!("{}{instruction}", TARGETS[stage as usize].1);
+            let numbers = map.coefficients().as_flattened();
             tensors.push((name, vec![TERMS, 2], bytes_of(numbers)));
         }
     }
@@ -56,7 +71,7 @@ pub fn encode(
 }
 
 /// Reads a file's bytes; every tensor must be there with its size, and no other.
-pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Option<Choice>, Description)> {
+pub fn decode(bytes: &[u8]) -> anyhow::Result<Contents> {
     let bytes_found = bytes.len() as u64;
     ensure!(
         bytes_found <= FILE_BYTES_MAX,
@@ -69,58 +84,73 @@ pub fn decode(bytes: &[u8]) -> anyhow::Result<(Network, Option<Choice>, Descript
     let description = description.with_context(|| {
         format!("verifier file: expected metadata {DESCRIPTION_KEY:?}, got none")
     })?;
-    let description: Description =
+    let description: VerifierDescription =
         serde_json::from_str(description).context("verifier description")?;
 
     let tensors = SafeTensors::deserialize(bytes).context("verifier file: expected safetensors")?;
-    let has_choice = description.choice.is_some();
-    let target_model = if has_choice { read_aims(&tensors)? } else { TargetModel::default() };
-    let expected = 2 + 2 * LAYERS.len() + usize::from(has_choice) + target_model.places().count();
+    let tensors: Tensors<'_> =
+        tensors.iter().map(|(name, view)| (current_name(name).into_owned(), view)).collect();
+    let network = read_network(&tensors, &description)?;
+    let ranking = match &description.ranking {
+        Some(_) => Some(read_ranking(&tensors, description.action_length)?),
+        None => None,
+    };
+    let maps = ranking.as_ref().map_or(0, |ranking| ranking.target_model().maps().count());
+    let expected = 2 + 2 * LAYERS.len() + usize::from(ranking.is_some()) + maps;
     ensure!(
         tensors.len() == expected,
         "verifier file: expected {expected} tensors, got {}",
         tensors.len()
     );
-    let mut outputs = [0; 3];
-    outputs[..2].copy_from_slice(&description.options.hidden_sizes);
-    outputs[2] = 1;
-    let mut inputs = description.input_size;
-    let standardisation = Standardisation {
-        mean: read(&tensors, MEAN, &[inputs])?,
-        deviation: read(&tensors, DEVIATION, &[inputs])?,
-    };
-    let mut layers = Vec::with_capacity(LAYERS.len());
-    for (name, outputs) in LAYERS.iter().zip(outputs) {
-        let weight = read(&tensors, &format!("{name}.weight"), &[outputs, inputs])?;
-        layers.push(
-            Layer::new(weight, read(&tensors, &format!("{name}.bias"), &[outputs])?)
-                .with_context(|| format!("tensor {name}"))?,
-        );
-        inputs = outputs;
-    }
-    let layers: [Layer; 3] =
-        layers.try_into().ok().context("verifier file: expected three layers")?;
-    let choice = match &description.choice {
-        Some(_) => {
-            let weights = read(&tensors, CHOICE, &[FEATURES])?;
-            Some(Choice::new(weights.try_into().expect("one per feature"), target_model)?)
-        }
-        None => None,
-    };
-    Ok((Network::new(standardisation, layers)?, choice, description))
+    Ok(Contents { network, ranking, description })
 }
 
-fn read_aims(tensors: &SafeTensors<'_>) -> anyhow::Result<TargetModel> {
-    let mut target_model = TargetModel::default();
-    for name in tensors.names() {
-        let found = AIMS.iter().find_map(|(stage, part)| Some((*stage, name.strip_prefix(part)?)));
-        let Some((stage, instruction)) = found else { continue };
-        let numbers = read(tensors, name, &[TERMS, 2])?;
-        let pairs = numbers.as_chunks::<2>().0;
-        let coefficients = pairs.try_into().expect("as many as terms");
-        target_model.insert(instruction, stage, Place::new(coefficients).context(name.to_owned())?);
+type Tensors<'a> = BTreeMap<String, TensorView<'a>>;
+
+/// Today's name of a tensor, some of which have others in files of the first format.
+fn current_name(name: &str) -> Cow<'_, str> {
+    match name.strip_prefix("aim.") {
+        Some(rest) => format!("target.{rest}").into(),
+        None if name == "choice.weight" => RANKING.into(),
+        None => name.into(),
     }
-    Ok(target_model)
+}
+
+fn read_network(
+    tensors: &Tensors<'_>,
+    description: &VerifierDescription,
+) -> anyhow::Result<Network> {
+    let [first, second] = description.options.hidden_sizes;
+    let mut inputs = description.input_size;
+    let standardisation = Standardisation {
+        mean: read(tensors, MEAN, &[inputs])?,
+        deviation: read(tensors, DEVIATION, &[inputs])?,
+    };
+    let mut layers = Vec::with_capacity(LAYERS.len());
+    for (name, outputs) in LAYERS.iter().zip([first, second, 1]) {
+        let weight = read(tensors, &format!("{name}.weight"), &[outputs, inputs])?;
+        let bias = read(tensors, &format!("{name}.bias"), &[outputs])?;
+        layers.push(Layer::new(weight, bias).with_context(|| format!("tensor {name}"))?);
+        inputs = outputs;
+    }
+    let layers = layers.try_into().ok().context("verifier file: expected three layers")?;
+    Network::new(standardisation, layers)
+}
+
+fn read_ranking(tensors: &Tensors<'_>, action_length: usize) -> anyhow::Result<Ranking> {
+    let layout = FeatureLayout { action_length };
+    let weights = read(tensors, RANKING, &[layout.length()])?;
+    let mut target_model = TargetModel::default();
+    for name in tensors.keys() {
+        let stage =
+            TARGETS.iter().find_map(|(stage, part)| Some((*stage, name.strip_prefix(part)?)));
+        let Some((stage, instruction)) = stage else { continue };
+        let numbers = read(tensors, name, &[TERMS, 2])?;
+        let coefficients = numbers.as_chunks::<2>().0.try_into().expect("as many as terms");
+        let map = TargetMap::new(coefficients).with_context(|| format!("tensor {name}"))?;
+        target_model.insert(instruction, stage, map);
+    }
+    Ranking::new(layout, weights, target_model)
 }
 
 /// SHA-256 in hexadecimal.
@@ -132,9 +162,9 @@ fn bytes_of(values: &[f32]) -> Vec<u8> {
     bytemuck::cast_slice(values).to_vec()
 }
 
-fn read(tensors: &SafeTensors<'_>, name: &str, shape: &[usize]) -> anyhow::Result<Vec<f32>> {
+fn read(tensors: &Tensors<'_>, name: &str, shape: &[usize]) -> anyhow::Result<Vec<f32>> {
     let tensor =
-        tensors.tensor(name).with_context(|| format!("verifier file: expected tensor {name}"))?;
+        tensors.get(name).with_context(|| format!("verifier file: expected tensor {name}"))?;
     ensure!(
         tensor.dtype() == Dtype::F32 && tensor.shape() == shape,
         "tensor {name}: expected F32 {shape:?}, got {:?} {:?}",

@@ -2,23 +2,22 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
-
-use super::probability;
+use decision::probability;
 use evaluation::calibration::{BINS, ReliabilityBin, brier_score, calibration_error, reliability};
 use evaluation::statistics::auroc;
+use serde::{Deserialize, Serialize};
 
 /// Steps that count as the beginning or the end of an episode.
 pub const PHASE_STEPS: usize = 10;
 
 /// Scored samples with their truth; the lists run in parallel.
 #[derive(Clone, Debug, Default)]
-pub struct HeldOut {
+pub struct ScoredSamples {
     /// The verifier's logits.
     pub logits: Vec<f32>,
     /// Whether the sample's episode succeeded.
     pub labels: Vec<bool>,
-    /// The sample's task.
+    /// The sample's task, with its variant where that is not the default one.
     pub tasks: Vec<String>,
     /// The sample's control step, counted from 0.
     pub steps: Vec<usize>,
@@ -26,9 +25,7 @@ pub struct HeldOut {
     pub episode_steps: Vec<usize>,
 }
 
-/// Quality on held-out samples.
-///
-/// Training stops by the held-out loss, so these figures are slightly kind to the verifier.
+/// Quality on samples of held-out episodes, which no weight was fitted to and nothing was chosen by.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Metrics {
@@ -38,9 +35,9 @@ pub struct Metrics {
     pub auroc: Discrimination,
     /// The first [`PHASE_STEPS`] steps, where choosing well still matters most.
     pub auroc_first_steps: Discrimination,
-    /// The steps between.
+    /// The steps between these.
     pub auroc_middle_steps: Discrimination,
-    /// The last [`PHASE_STEPS`] steps, where the outcome can often be seen.
+    /// The last [`PHASE_STEPS`] steps, where the outcome is often visible.
     pub auroc_last_steps: Discrimination,
     /// Mean squared difference of probability and outcome.
     pub brier_score: Option<f64>,
@@ -52,8 +49,8 @@ pub struct Metrics {
 
 /// AUROC in three views; `None` where a class is missing.
 ///
-/// The pooled value misleads: knowing which task is easy already raises it, and that chooses nothing among the candidates
-/// of one step. The macro average is free of that, yet it still rewards recognising an easy layout.
+/// The pooled value misleads: telling easy tasks from hard ones already raises it, and that ranks no candidate of a
+/// decision. The macro average is free of that, yet it still rewards recognising an easy layout.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Discrimination {
@@ -67,19 +64,18 @@ pub struct Discrimination {
 
 impl Metrics {
     /// Measures scored samples; `positive_share` is the share of positives that gave the training its class weights.
-    pub fn measure(held_out: &HeldOut, positive_share: f64) -> Metrics {
+    pub fn measure(samples: &ScoredSamples, positive_share: f64) -> Metrics {
         let probabilities: Vec<f32> =
-            held_out.logits.iter().map(|logit| probability(*logit)).collect();
-        let reliability = reliability(&probabilities, &held_out.labels, BINS);
+            samples.logits.iter().map(|logit| probability(*logit)).collect();
+        let reliability = reliability(&probabilities, &samples.labels, BINS);
+        let phase = |phase| samples.discrimination(|index| samples.phase(index) == phase);
         Metrics {
-            loss: weighted_loss(&held_out.logits, &held_out.labels, positive_share),
-            auroc: held_out.discrimination(|_| true),
-            auroc_first_steps: held_out
-                .discrimination(|index| held_out.phase(index) == Phase::First),
-            auroc_middle_steps: held_out
-                .discrimination(|index| held_out.phase(index) == Phase::Middle),
-            auroc_last_steps: held_out.discrimination(|index| held_out.phase(index) == Phase::Last),
-            brier_score: brier_score(&probabilities, &held_out.labels),
+            loss: weighted_loss(&samples.logits, &samples.labels, positive_share),
+            auroc: samples.discrimination(|_| true),
+            auroc_first_steps: phase(Phase::First),
+            auroc_middle_steps: phase(Phase::Middle),
+            auroc_last_steps: phase(Phase::Last),
+            brier_score: brier_score(&probabilities, &samples.labels),
             calibration_error: calibration_error(&reliability),
             reliability,
         }
@@ -93,7 +89,7 @@ enum Phase {
     Last,
 }
 
-impl HeldOut {
+impl ScoredSamples {
     fn phase(&self, index: usize) -> Phase {
         let step = self.steps[index];
         if step < PHASE_STEPS {
@@ -148,8 +144,8 @@ fn softplus(x: f64) -> f64 {
 mod tests {
     use super::*;
 
-    fn held_out(rows: &[(f32, bool, &str, usize, usize)]) -> HeldOut {
-        HeldOut {
+    fn samples(rows: &[(f32, bool, &str, usize, usize)]) -> ScoredSamples {
+        ScoredSamples {
             logits: rows.iter().map(|row| row.0).collect(),
             labels: rows.iter().map(|row| row.1).collect(),
             tasks: rows.iter().map(|row| row.2.to_owned()).collect(),
@@ -164,7 +160,7 @@ mod tests {
         let rows: Vec<_> = (0..8)
             .map(|i| if i < 4 { (1.0, i != 0, "a", 0, 60) } else { (-1.0, i == 4, "b", 0, 60) })
             .collect();
-        let auroc = Metrics::measure(&held_out(&rows), 0.5).auroc;
+        let auroc = Metrics::measure(&samples(&rows), 0.5).auroc;
         assert_eq!(auroc.pooled, Some(0.75));
         assert_eq!(auroc.macro_average, Some(0.5));
         assert_eq!(
@@ -188,7 +184,7 @@ mod tests {
             rows.push((strength, true, "a", step, 30));
             rows.push((-strength, false, "a", step, 30));
         }
-        let metrics = Metrics::measure(&held_out(&rows), 0.5);
+        let metrics = Metrics::measure(&samples(&rows), 0.5);
         assert_eq!(metrics.auroc_first_steps.pooled, Some(0.0));
         assert_eq!(metrics.auroc_middle_steps.pooled, Some(0.5));
         assert_eq!(metrics.auroc_last_steps.pooled, Some(1.0));
@@ -198,10 +194,10 @@ mod tests {
     #[test]
     fn a_task_with_one_class_has_no_value_and_does_not_spoil_the_average() {
         let rows = [(1.0, true, "a", 0, 60), (0.0, false, "a", 0, 60), (0.5, true, "b", 0, 60)];
-        let metrics = Metrics::measure(&held_out(&rows), 0.5);
+        let metrics = Metrics::measure(&samples(&rows), 0.5);
         assert_eq!(metrics.auroc.tasks["b"], None);
         assert_eq!(metrics.auroc.macro_average, Some(1.0));
-        let empty = Metrics::measure(&HeldOut::default(), 0.5);
+        let empty = Metrics::measure(&ScoredSamples::default(), 0.5);
         assert_eq!((empty.loss, empty.auroc.pooled, empty.calibration_error), (None, None, None));
     }
 

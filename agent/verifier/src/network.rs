@@ -4,6 +4,13 @@
 
 use anyhow::ensure;
 
+/// Largest absolute value of a hidden state: the largest 16-bit float, which is what records keep.
+const INPUT_MAX: f64 = 65_504.0;
+
+/// A network in which some hidden state could make a larger sum is refused. Training makes sums of at most about 1e10;
+/// 32 bits end at 3e38.
+const SUM_MAX: f64 = 1e30;
+
 /// Shift and scale that make every input about as large as the others, measured on the training samples.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Standardisation {
@@ -99,6 +106,16 @@ impl Layer {
         &self.bias
     }
 
+    /// The largest absolute value of each output for inputs within `bounds`.
+    fn bounds(&self, bounds: &[f64]) -> Vec<f64> {
+        let output = |(weights, bias): (&[f32], &f32)| {
+            let products = weights.iter().zip(bounds);
+            products.map(|(weight, bound)| f64::from(weight.abs()) * bound).sum::<f64>()
+                + f64::from(bias.abs())
+        };
+        self.weight.chunks_exact(self.inputs()).zip(&self.bias).map(output).collect()
+    }
+
     fn apply(&self, input: &[f32]) -> Vec<f32> {
         let mut output = self.bias.clone();
         for (value, weights) in input.iter().zip(self.transposed.chunks_exact(self.bias.len())) {
@@ -128,7 +145,7 @@ impl Network {
         );
         ensure!(
             standardisation.mean.iter().all(|value| value.is_finite()),
-            "standardisation: expected finite means"
+            "standardisation: expected finite means, got NaN or infinity"
         );
         let [first, second, last] = &layers;
         let sizes = [
@@ -143,7 +160,29 @@ impl Network {
                 "verifier layers: expected a size of {expected}, got {found}"
             );
         }
-        Ok(Network { standardisation, layers })
+        let network = Network { standardisation, layers };
+        let sum = network.sum_max();
+        ensure!(
+            sum <= SUM_MAX,
+            "verifier network: expected sums of at most {SUM_MAX:e} for any 16-bit hidden state, got up to {sum:e}"
+        );
+        Ok(network)
+    }
+
+    /// The largest absolute value that any sum can reach while a hidden state of 16-bit floats is scored: a logit is
+    /// finite where this is.
+    fn sum_max(&self) -> f64 {
+        let Standardisation { mean, deviation } = &self.standardisation;
+        let input = mean.iter().zip(deviation);
+        let mut bounds: Vec<f64> = input
+            .map(|(mean, deviation)| (INPUT_MAX + f64::from(mean.abs())) / f64::from(*deviation))
+            .collect();
+        let mut largest = bounds.iter().copied().fold(0.0, f64::max);
+        for layer in &self.layers {
+            bounds = layer.bounds(&bounds);
+            largest = bounds.iter().copied().fold(largest, f64::max);
+        }
+        largest
     }
 
     /// Length of a hidden state.
@@ -202,6 +241,25 @@ mod tests {
         assert!((standardisation.deviation[0] - 3.5_f32.sqrt()).abs() < 1e-6);
         // A constant feature is only shifted.
         assert_eq!(standardisation.apply(&[3.0, 6.0]), [0.0, 1.0]);
+    }
+
+    #[test]
+    fn a_network_is_accepted_only_if_every_16_bit_hidden_state_has_a_finite_logit() {
+        let network = |deviation: f32, weight: f32, bias: f32| {
+            let standardisation = Standardisation { mean: vec![1.0], deviation: vec![deviation] };
+            let layers = [vec![1.0], vec![1.0], vec![weight]];
+            let layers = layers.map(|weight| Layer::new(weight, vec![bias]).expect("whole"));
+            Network::new(standardisation, layers)
+        };
+        for (deviation, weight, bias) in [(1.0, 3e38, 0.0), (1.0, 1.0, 3e38), (1e-38, 1.0, 0.0)] {
+            let error = network(deviation, weight, bias).expect_err("huge").to_string();
+            let expected = "expected sums of at most 1e30 for any 16-bit hidden state, got up to ";
+            assert!(error.contains(expected), "{error}");
+        }
+        let largest = network(1.0, 1e25, 0.0).expect("within the bound");
+        let logits = [65_504.0, -65_504.0].map(|value| largest.logit(&[value]));
+        assert!(logits.iter().all(|logit| logit.is_finite()), "{logits:?}");
+        assert!((logits[0] - 65_503e25).abs() < 1e24, "{logits:?}");
     }
 
     #[test]

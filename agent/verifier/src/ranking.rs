@@ -2,64 +2,92 @@
 //!
 //! The score of a hidden state mostly says how promising the situation is, which is the same for all candidates of one
 //! decision. This part looks only at what differs between them: how sure the policy was of each part of the reasoning and
-//! of the action, how far the action is from those of its siblings, and how near it brings the gripper to where all the
-//! words so far say that it should go. It is linear, because one action changes an
-//! episode's outcome by little and only few numbers can be learnt from that.
+//! of the action, how far the action is from those of the others, and how near it brings the gripper to its target. It is
+//! linear, because one action changes an episode's outcome by little and only few numbers can be learned from that.
 
 use std::ops::Range;
 
 use anyhow::ensure;
+use decision::{
+    ActionChunk, ActionSpace, Candidate, CandidateAction, STAGES, TAGS, distance_mean,
+};
 
-use super::aim::{TargetModel, STAGES, Target, ReasoningFeatures};
-use vla::{Confidence, PARTS};
-use decision::{CandidateAction, distance_mean};
+use crate::target::{PredictedTarget, TargetModel};
 
-/// Numbers of an action.
-const NUMBERS: usize = 7;
-/// The nearness to the siblings, whose largest is the medoid's.
-pub const NEARNESS: usize = PARTS + NUMBERS;
-/// The nearness to the target, one for each stage.
-pub const AIM: Range<usize> = NEARNESS + 1..NEARNESS + 1 + STAGES;
-/// Log-probabilities of the parts, sizes of the deviations, nearness to the siblings and to the target.
-pub const FEATURES: usize = AIM.end;
+/// A larger weight is refused: features are of the order of 1, and a probability changes by at most 1.
+const WEIGHT_MAX: f32 = 1e6;
 
-/// Features of which more is never better: the sizes of the deviations. Of all others less is never better.
-pub const PENALTIES: Range<usize> = PARTS..PARTS + NUMBERS;
-
-/// How one candidate differs from its siblings; every feature's mean over the siblings is 0.
-pub type Features = [f32; FEATURES];
-
-/// A well-formed candidate beside others.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sibling {
-    /// What it would do.
-    pub action: CandidateAction,
-    /// How sure the policy was of its parts.
-    pub confidence: Confidence,
-    /// Where it sees what; none when it does not say.
-    pub words: Option<ReasoningFeatures>,
+/// Where each feature of a candidate stands; how many there are depends on the policy's actions.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FeatureLayout {
+    /// Numbers of an action.
+    pub action_length: usize,
 }
 
-/// What has been learnt of choosing.
+impl FeatureLayout {
+    /// Log-probabilities of the parts of the reasoning and of the numbers of the action.
+    pub fn confidence(self) -> Range<usize> {
+        0..TAGS.len() + self.action_length
+    }
+
+    /// Distance of each number of the action from the candidates' mean. The penalties: of these more is never better,
+    /// of all other features less is never better.
+    pub fn deviations(self) -> Range<usize> {
+        let start = self.confidence().end;
+        start..start + self.action_length
+    }
+
+    /// Nearness to the other candidates, which is largest for the medoid.
+    pub fn nearness(self) -> usize {
+        self.deviations().end
+    }
+
+    /// Nearness to the target, one for each stage.
+    pub fn target(self) -> Range<usize> {
+        let start = self.nearness() + 1;
+        start..start + STAGES
+    }
+
+    /// Number of features.
+    pub fn length(self) -> usize {
+        self.target().end
+    }
+}
+
+/// What has been learned of how candidates rank.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Choice {
+pub struct Ranking {
+    layout: FeatureLayout,
     /// The change of the probability of success per unit of each feature.
-    weights: Features,
+    weights: Vec<f32>,
     target_model: TargetModel,
 }
 
-impl Choice {
-    /// Refuses weights that are not numbers.
-    pub fn new(weights: Features, target_model: TargetModel) -> anyhow::Result<Choice> {
-        ensure!(
-            weights.iter().all(|weight| weight.is_finite()),
-            "choice weights: expected finite values, got NaN or infinity"
-        );
-        Ok(Choice { weights, target_model })
+impl Ranking {
+    /// Refuses weights that are too few, too many, not finite or huge.
+    pub fn new(
+        layout: FeatureLayout,
+        weights: Vec<f32>,
+        target_model: TargetModel,
+    ) -> anyhow::Result<Ranking> {
+        let (expected, got) = (layout.length(), weights.len());
+        ensure!(got == expected, "ranking weights: expected {expected} values, got {got}");
+        for weight in &weights {
+            ensure!(
+                weight.abs() <= WEIGHT_MAX,
+                "ranking weights: expected at most {WEIGHT_MAX}, got {weight}"
+            );
+        }
+        Ok(Ranking { layout, weights, target_model })
+    }
+
+    /// What the weights belong to.
+    pub fn layout(&self) -> FeatureLayout {
+        self.layout
     }
 
     /// One for each feature.
-    pub fn weights(&self) -> &Features {
+    pub fn weights(&self) -> &[f32] {
         &self.weights
     }
 
@@ -68,129 +96,242 @@ impl Choice {
         &self.target_model
     }
 
-    /// The change of the probability of success that a candidate brings, against the mean of its siblings.
-    pub fn advantage(&self, features: &Features) -> f32 {
+    /// The change of the probability of success that a candidate brings, against the mean of all candidates.
+    pub fn advantage(&self, features: &[f32]) -> f32 {
         self.weights.iter().zip(features).map(|(weight, value)| weight * value).sum()
     }
 }
 
-/// The same features with another target; `actions` are those of the candidates.
-pub fn retarget(features: &mut [Features], actions: &[[f32; NUMBERS]], target: Option<Target>) {
-    let near = |target: Target| actions.iter().map(move |action| -target.distance(action));
-    let mean = target.map_or(0.0, |target| near(target).sum::<f32>() / actions.len() as f32);
-    for (features, action) in features.iter_mut().zip(actions) {
-        features[AIM].fill(0.0);
-        if let Some(target) = target {
-            features[AIM.start + target.stage as usize] = -target.distance(action) - mean;
+/// How the well-formed candidates of one decision differ, one row of features each; every feature's mean is 0.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CandidateFeatures {
+    layout: FeatureLayout,
+    rows: Vec<Vec<f32>>,
+    /// How far each candidate moves the gripper, x and y in the base frame, metres.
+    motions: Vec<[f32; 2]>,
+}
+
+impl CandidateFeatures {
+    /// Compares candidates, without a target yet; refuses those that do not have the policy's parts and numbers.
+    ///
+    /// Deviations are those from the mean action, without their sign: a ranking that always leans to the better side
+    /// leaves the states in which that side was better. A number without range cannot tell candidates apart and
+    /// deviates by 0. Of a chunk of several actions the mean counts.
+    pub fn of(candidates: &[Candidate], space: &ActionSpace) -> anyhow::Result<CandidateFeatures> {
+        let layout = FeatureLayout { action_length: space.length() };
+        let well_formed: Vec<(&Candidate, CandidateAction<'_>)> =
+            candidates.iter().filter_map(|one| Some((one, one.action()?))).collect();
+        for (candidate, action) in &well_formed {
+            let (expected, got) = (layout.confidence().len(), candidate.confidence.len());
+            ensure!(
+                got == expected,
+                "expected a candidate with the log-probabilities of {expected} parts, got {got}"
+            );
+            let (expected, got) = (layout.action_length, action.actions.action_length());
+            ensure!(got == expected, "expected actions of {expected} numbers, got {got}");
         }
+        let actions: Vec<Option<CandidateAction<'_>>> =
+            well_formed.iter().map(|(_, action)| Some(*action)).collect();
+        let scaled = |action: &CandidateAction<'_>| -> Vec<f32> {
+            let count = action.actions.actions().len() as f32;
+            let numbers = motion(action.actions).into_iter().zip(&space.scale);
+            let scaled = |(sum, scale): (f32, &f32)| {
+                if *scale > 0.0 { sum / count / scale } else { 0.0 }
+            };
+            numbers.map(scaled).collect()
+        };
+        let scaled: Vec<Vec<f32>> = well_formed.iter().map(|(_, action)| scaled(action)).collect();
+        let action_mean = mean(&scaled, layout.action_length);
+        let row = |(index, (candidate, action)): (usize, &(&Candidate, CandidateAction<'_>))| {
+            let mut row = vec![0.0; layout.length()];
+            row[layout.confidence()].copy_from_slice(&candidate.confidence);
+            let numbers = scaled[index].iter().zip(&action_mean);
+            for (deviation, (value, mean)) in row[layout.deviations()].iter_mut().zip(numbers) {
+                *deviation = (value - mean).abs();
+            }
+            row[layout.nearness()] = -distance_mean(&actions, index, action, space) as f32;
+            row
+        };
+        let mut rows: Vec<Vec<f32>> = well_formed.iter().enumerate().map(row).collect();
+        let rows_mean = mean(&rows, layout.length());
+        for row in &mut rows {
+            row.iter_mut().zip(&rows_mean).for_each(|(value, mean)| *value -= mean);
+        }
+        let motions = well_formed.iter().map(|(_, action)| {
+            let motion = motion(action.actions);
+            [0, 1].map(|axis| motion.get(axis).copied().unwrap_or(0.0))
+        });
+        Ok(CandidateFeatures { layout, motions: motions.collect(), rows })
+    }
+
+    /// Fills in how much nearer than the mean each candidate brings the gripper to the target.
+    pub fn set_target(&mut self, target: Option<PredictedTarget>) {
+        let distances = |target: PredictedTarget| {
+            self.motions.iter().map(move |motion| -target.distance(*motion))
+        };
+        let count = self.motions.len() as f32;
+        let mean = target.map_or(0.0, |target| distances(target).sum::<f32>() / count);
+        for (row, motion) in self.rows.iter_mut().zip(&self.motions) {
+            row[self.layout.target()].fill(0.0);
+            if let Some(target) = target {
+                let feature = self.layout.target().start + target.stage as usize;
+                row[feature] = -target.distance(*motion) - mean;
+            }
+        }
+    }
+
+    /// What the features mean.
+    pub fn layout(&self) -> FeatureLayout {
+        self.layout
+    }
+
+    /// One row for each well-formed candidate, in their order.
+    pub fn rows(&self) -> &[Vec<f32>] {
+        &self.rows
     }
 }
 
-/// The features of every well-formed candidate; `action_scale` is one unit of each number of an action.
-///
-/// Deviations are those from the mean action, without their sign: whoever always leans to the better side leaves the
-/// states in which that side was seen to be better. A number without range cannot tell candidates apart and deviates by 0.
-pub fn features(
-    siblings: &[Option<Sibling>],
-    action_scale: &[f32; NUMBERS],
-    target: Option<Target>,
-) -> Vec<Option<Features>> {
-    let candidates: Vec<Option<CandidateAction>> =
-        siblings.iter().map(|sibling| sibling.as_ref().map(|sibling| sibling.action)).collect();
-    let scaled = |candidate: &CandidateAction| -> [f32; NUMBERS] {
-        std::array::from_fn(|index| {
-            let scale = action_scale[index];
-            if scale > 0.0 { candidate.action[index] / scale } else { 0.0 }
-        })
-    };
-    let action_mean: [f32; NUMBERS] =
-        mean(&candidates.iter().flatten().map(scaled).collect::<Vec<_>>());
-    let raw = siblings.iter().enumerate().map(|(index, sibling)| {
-        let Sibling { action, confidence, .. } = sibling.as_ref()?;
-        let mut features = [0.0; FEATURES];
-        let (parts, deviations) = features.split_at_mut(PARTS);
-        parts.copy_from_slice(confidence);
-        for (number, value) in scaled(action).iter().enumerate() {
-            deviations[number] = (value - action_mean[number]).abs();
-        }
-        features[NEARNESS] = -distance_mean(&candidates, index, action) as f32;
-        if let Some(target) = target {
-            features[AIM.start + target.stage as usize] = -target.distance(&action.action);
-        }
-        Some(features)
-    });
-    let raw: Vec<Option<Features>> = raw.collect();
-    let features_mean: Features = mean(&raw.iter().flatten().copied().collect::<Vec<_>>());
-    let centre = |row: Features| std::array::from_fn(|index| row[index] - features_mean[index]);
-    raw.into_iter().map(|row| row.map(centre)).collect()
+/// The sum of a chunk's actions, number by number.
+fn motion(actions: &ActionChunk) -> Vec<f32> {
+    let mut sum = vec![0.0; actions.action_length()];
+    for action in actions.actions() {
+        sum.iter_mut().zip(action).for_each(|(sum, number)| *sum += number);
+    }
+    sum
 }
 
-/// The mean of rows; zeros when there is none.
-fn mean<const SIZE: usize>(rows: &[[f32; SIZE]]) -> [f32; SIZE] {
-    let mut sum = [0.0; SIZE];
+/// The mean of rows of `length` values; zeros when there is none.
+fn mean(rows: &[Vec<f32>], length: usize) -> Vec<f32> {
+    let mut sum = vec![0.0; length];
     for row in rows {
         sum.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
     }
-    sum.map(|sum| sum / rows.len().max(1) as f32)
+    sum.iter_mut().for_each(|sum| *sum /= rows.len().max(1) as f32);
+    sum
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use decision::Stage;
+    use decision::{Malformed, Parsed, Reasoning, Stage};
 
-    const SCALE: [f32; 7] = [0.1, 0.1, 0.1, 0.0, 0.1, 0.1, 2.0];
+    const BRIDGE: FeatureLayout = FeatureLayout { action_length: 7 };
 
-    fn at(x: f32, bin: u32, gripper: f32) -> Option<Sibling> {
-        let tokens = [bin, 500, 500, 500, 500, 500, if gripper > 0.0 { 599 } else { 400 }];
-        let action = CandidateAction { tokens, action: [x, 0.0, 0.0, 9.0, 0.0, 0.0, gripper] };
-        let mut confidence = [0.0; PARTS];
+    fn space() -> ActionSpace {
+        ActionSpace { scale: vec![0.1, 0.1, 0.1, 0.0, 0.1, 0.1, 2.0], gripper: Some(6) }
+    }
+
+    fn candidate(
+        tokens: Vec<u32>,
+        actions: Vec<Vec<f32>>,
+        confidence: Vec<f32>,
+    ) -> Candidate {
+        let actions = ActionChunk::new(actions).expect("finite");
+        Candidate {
+            tokens: Vec::new(),
+            log_probability: -1.0,
+            log_probabilities: Vec::new(),
+            confidence,
+            hidden: Vec::new(),
+            parsed: Ok(Parsed { reasoning: Reasoning::default(), action_tokens: tokens, actions }),
+        }
+    }
+
+    /// One that moves by x; the policy is the less sure of its third part the farther it moves.
+    fn moving(x: f32, bin: u32, gripper: f32) -> Candidate {
+        let tokens = vec![bin, 500, 500, 500, 500, 500, if gripper > 0.0 { 599 } else { 400 }];
+        let mut confidence = vec![0.0; BRIDGE.confidence().len()];
         confidence[2] = -10.0 * x;
-        Some(Sibling { action, confidence, words: None })
+        candidate(tokens, vec![vec![x, 0.0, 0.0, 9.0, 0.0, 0.0, gripper]], confidence)
+    }
+
+    fn malformed() -> Candidate {
+        Candidate { parsed: Err(Malformed::new("expected an action, got none")), ..moving(0.1, 500, 1.0) }
+    }
+
+    fn check(rows: &[Vec<f32>], index: usize, expected: [f32; 3]) {
+        let found: Vec<f32> = rows.iter().map(|row| row[index]).collect();
+        let near = found.iter().zip(expected).all(|(found, one)| (found - one).abs() < 1e-5);
+        assert!(near && found.len() == 3, "feature {index}: expected {expected:?}, got {found:?}");
     }
 
     #[test]
-    fn features_are_relative_to_the_siblings() {
-        let candidates = [at(0.1, 500, 1.0), None, at(0.3, 551, 1.0), at(0.2, 500, -1.0)];
-        let target = Target { stage: Stage::Place, offset: [0.2, 0.0] };
-        let rows = features(&candidates, &SCALE, Some(target));
-        assert!(rows[1].is_none());
-        let rows: Vec<Features> = rows.into_iter().flatten().collect();
-        let check = |index: usize, expected: [f32; 3]| {
-            let found = [rows[0][index], rows[1][index], rows[2][index]];
-            let near = found.iter().zip(expected).all(|(found, one)| (found - one).abs() < 1e-5);
-            assert!(near, "feature {index}: expected {expected:?}, got {found:?}");
-        };
+    fn features_are_relative_to_the_other_candidates() {
+        let candidates =
+            [moving(0.1, 500, 1.0), malformed(), moving(0.3, 551, 1.0), moving(0.2, 500, -1.0)];
+        let mut features = CandidateFeatures::of(&candidates, &space()).expect("whole");
         // Log-probabilities -1, -3 and -2.
-        check(2, [1.0, -1.0, 0.0]);
+        check(features.rows(), 2, [1.0, -1.0, 0.0]);
         // x deviates by 1, 1 and 0 units of 0.1; their mean is 2/3.
-        check(PARTS, [1.0 / 3.0, 1.0 / 3.0, -2.0 / 3.0]);
+        let deviations = BRIDGE.deviations().start;
+        check(features.rows(), deviations, [1.0 / 3.0, 1.0 / 3.0, -2.0 / 3.0]);
         // Roll has no range here.
-        check(PARTS + 3, [0.0; 3]);
+        check(features.rows(), deviations + 3, [0.0; 3]);
         // The gripper, of which one unit is 2: two open, one closed, the mean at 1/3.
-        check(PARTS + 6, [-1.0 / 9.0, -1.0 / 9.0, 2.0 / 9.0]);
+        check(features.rows(), deviations + 6, [-1.0 / 9.0, -1.0 / 9.0, 2.0 / 9.0]);
         // Mean distances 0.6, 0.7 and 1.1 (51 bins are a fifth of the range, the other gripper side is 1).
-        check(PARTS + 7, [0.2, 0.1, -0.3]);
-        // Nothing is grasped; 10, 10 and 0 cm from the place.
-        check(AIM.start, [0.0; 3]);
-        check(AIM.start + 1, [-0.1 / 3.0, -0.1 / 3.0, 0.2 / 3.0]);
-        let plain = features(&candidates, &SCALE, None).into_iter().flatten();
-        let mut plain: Vec<Features> = plain.collect();
-        assert_eq!(plain[2][AIM.start + 1], 0.0);
-        let actions: Vec<_> = candidates.iter().flatten().map(|one| one.action.action).collect();
-        retarget(&mut plain, &actions, Some(target));
-        let pairs = plain.as_flattened().iter().zip(rows.as_flattened());
-        assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-6));
-        retarget(&mut plain, &actions, None);
-        assert_eq!(plain[2][AIM.start + 1], 0.0);
+        check(features.rows(), BRIDGE.nearness(), [0.2, 0.1, -0.3]);
+        check(features.rows(), BRIDGE.target().start + 1, [0.0; 3]);
+        // Nothing is grasped; 10, 10 and 0 cm from the target.
+        features.set_target(Some(PredictedTarget { stage: Stage::Place, offset: [0.2, 0.0] }));
+        check(features.rows(), BRIDGE.target().start, [0.0; 3]);
+        check(features.rows(), BRIDGE.target().start + 1, [-0.1 / 3.0, -0.1 / 3.0, 0.2 / 3.0]);
+        features.set_target(None);
+        check(features.rows(), BRIDGE.target().start + 1, [0.0; 3]);
+    }
+
+    #[test]
+    fn actions_may_have_any_length_and_chunks_any_number_of_them() {
+        let space = ActionSpace { scale: vec![0.5, 1.0], gripper: None };
+        let layout = FeatureLayout { action_length: 2 };
+        let chunk = |x: f32| vec![vec![x, 0.0], vec![2.0 * x, 0.0]];
+        let of = |x: f32| candidate(Vec::new(), chunk(x), vec![0.0; layout.confidence().len()]);
+        let candidates = [of(1.0), of(2.0), of(3.0)];
+        let mut features = CandidateFeatures::of(&candidates, &space).expect("whole");
+        assert_eq!((layout.length(), features.layout()), (16, layout));
+        // Means of 1.5, 3 and 4.5, in units of 0.5, deviate by 3, 0 and 3.
+        check(features.rows(), layout.deviations().start, [1.0, -2.0, 1.0]);
+        // Moved by 3, 6 and 9.
+        features.set_target(Some(PredictedTarget { stage: Stage::Grasp, offset: [9.0, 0.0] }));
+        check(features.rows(), layout.target().start, [-3.0, 0.0, 3.0]);
     }
 
     #[test]
     fn a_lone_candidate_has_no_advantage() {
-        let choice = Choice::new([3.0; FEATURES], TargetModel::default()).expect("finite");
-        let rows = features(&[None, at(0.3, 551, -1.0)], &SCALE, None);
-        assert_eq!(choice.advantage(&rows[1].expect("well formed")), 0.0);
-        assert!(features(&[None, None], &SCALE, None).iter().all(Option::is_none));
-        assert!(Choice::new([f32::NAN; FEATURES], TargetModel::default()).is_err());
+        let weights = vec![3.0; BRIDGE.length()];
+        let ranking = Ranking::new(BRIDGE, weights, TargetModel::default()).expect("finite");
+        let features = CandidateFeatures::of(&[malformed(), moving(0.3, 551, -1.0)], &space());
+        assert_eq!(ranking.advantage(&features.expect("whole").rows()[0]), 0.0);
+        let features = CandidateFeatures::of(&[malformed(), malformed()], &space());
+        assert!(features.expect("whole").rows().is_empty());
+    }
+
+    #[test]
+    fn candidates_of_another_policy_are_refused() {
+        let mut other = moving(0.1, 500, 1.0);
+        other.confidence.pop();
+        let refuse = |candidate: Candidate, space: &ActionSpace| {
+            CandidateFeatures::of(&[candidate], space).expect_err("refused").to_string()
+        };
+        assert_eq!(
+            refuse(other, &space()),
+            "expected a candidate with the log-probabilities of 16 parts, got 15"
+        );
+        let mut shorter = moving(0.1, 500, 1.0);
+        shorter.confidence.pop();
+        let space = ActionSpace { scale: vec![1.0; 6], gripper: None };
+        assert_eq!(refuse(shorter, &space), "expected actions of 6 numbers, got 7");
+    }
+
+    #[test]
+    fn weights_that_are_no_changes_of_a_probability_are_refused() {
+        let refuse = |weights: Vec<f32>| {
+            let ranking = Ranking::new(BRIDGE, weights, TargetModel::default());
+            ranking.expect_err("refused").to_string()
+        };
+        let with = |weight: f32| vec![weight; BRIDGE.length()];
+        assert_eq!(refuse(with(f32::NAN)), "ranking weights: expected at most 1000000, got NaN");
+        assert!(refuse(with(3e38)).starts_with("ranking weights: expected at most 1000000, got 3"));
+        assert_eq!(refuse(vec![0.0; 25]), "ranking weights: expected 26 values, got 25");
     }
 }

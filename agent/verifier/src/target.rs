@@ -1,8 +1,8 @@
 //! Where the gripper should go, given where the objects are.
 //!
-//! Which position of the gripper belongs to an object's box is learnt from where grasps were made and where successful
-//! episodes released the object. A candidate whose action brings the gripper nearer to that position agrees with what the
-//! reasoning said all along.
+//! Which position of the gripper belongs to an object's bounding box is learned from where grasps were made and where
+//! successful episodes released the object. A candidate whose action brings the gripper nearer to that position agrees
+//! with all the reasoning of the episode so far.
 
 use std::collections::BTreeMap;
 
@@ -15,6 +15,9 @@ pub const TERMS: usize = 15;
 /// Sides are counted from the middle of the square, in units of this many pixels.
 const UNIT_PIXELS: f64 = 64.0;
 
+/// A map with a larger coefficient is refused: no gripper is a kilometre away from its base.
+const COEFFICIENT_MAX: f32 = 1e3;
+
 /// From an object's box to a position of the gripper: x and y in the robot's base frame, metres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TargetMap {
@@ -22,12 +25,14 @@ pub struct TargetMap {
 }
 
 impl TargetMap {
-    /// Refuses coefficients that are not finite.
+    /// Refuses coefficients that are not finite or larger than any gripper's reach.
     pub fn new(coefficients: [[f32; 2]; TERMS]) -> anyhow::Result<TargetMap> {
-        ensure!(
-            coefficients.as_flattened().iter().all(|number| number.is_finite()),
-            "target map: expected finite coefficients, got NaN or infinity"
-        );
+        for number in coefficients.as_flattened() {
+            ensure!(
+                number.abs() <= COEFFICIENT_MAX,
+                "target map: expected coefficients of at most {COEFFICIENT_MAX} m, got {number}"
+            );
+        }
         Ok(TargetMap { coefficients })
     }
 
@@ -37,11 +42,11 @@ impl TargetMap {
     }
 
     /// Where the gripper should be for an object with these bounds.
-    pub fn at(&self, bounds: &BoundingBox) -> [f32; 2] {
+    pub fn position(&self, bounds: &BoundingBox) -> [f32; 2] {
         let terms = terms(bounds);
         [0, 1].map(|axis| {
-            let parts = terms.iter().zip(&self.coefficients);
-            parts.map(|(term, of)| term * f64::from(of[axis])).sum::<f64>() as f32
+            let products = terms.iter().zip(&self.coefficients);
+            products.map(|(term, of)| term * f64::from(of[axis])).sum::<f64>() as f32
         })
     }
 }
@@ -64,46 +69,45 @@ pub struct TargetModel {
     maps: BTreeMap<(String, Stage), TargetMap>,
 }
 
-/// Where to go from here.
+/// Where the gripper should go from where it is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PredictedTarget {
-    /// For what.
+    /// What it heads for.
     pub stage: Stage,
     /// From the gripper, x and y in the base frame, metres.
     pub offset: [f32; 2],
 }
 
 impl TargetModel {
-    /// Adds or remaps the place of a stage.
+    /// Adds or replaces the map of a stage.
     pub fn insert(&mut self, instruction: &str, stage: Stage, map: TargetMap) {
         self.maps.insert((instruction.to_owned(), stage), map);
     }
 
     /// All maps with their instruction and stage.
     pub fn maps(&self) -> impl Iterator<Item = (&str, Stage, &TargetMap)> {
-        self.maps
-            .iter()
-            .map(|((instruction, stage), map)| (instruction.as_str(), *stage, map))
+        self.maps.iter().map(|((instruction, stage), map)| (instruction.as_str(), *stage, map))
     }
 
-    /// The target of a gripper at x, y; none when the gripper heads for nothing or nothing is known of it.
-    pub fn target(
+    /// The target of a gripper at x, y; none when that is not known, the gripper heads for no object or the
+    /// instruction has no map.
+    pub fn predict(
         &self,
         instruction: &str,
         tracked: &TrackedObjects,
-        gripper: [f32; 2],
+        gripper: Option<[f32; 2]>,
     ) -> Option<PredictedTarget> {
-        let stage = tracked.stage?;
+        let (stage, gripper) = (tracked.stage?, gripper?);
         let bounds = tracked.bounds[stage as usize]?;
-        let [x, y] = self.maps.get(&(instruction.to_owned(), stage))?.at(&bounds);
+        let [x, y] = self.maps.get(&(instruction.to_owned(), stage))?.position(&bounds);
         Some(PredictedTarget { stage, offset: [x - gripper[0], y - gripper[1]] })
     }
 }
 
 impl PredictedTarget {
-    /// How far the gripper is from it after an action, metres.
-    pub fn distance(&self, action: &[f32]) -> f32 {
-        (self.offset[0] - action[0]).hypot(self.offset[1] - action[1])
+    /// How far the gripper is from it after moving by x and y, metres.
+    pub fn distance(&self, motion: [f32; 2]) -> f32 {
+        (self.offset[0] - motion[0]).hypot(self.offset[1] - motion[1])
     }
 }
 
@@ -112,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_target_is_where_the_place_of_the_stage_lies_from_the_gripper() {
+    fn a_target_is_where_the_map_of_the_stage_puts_it_from_the_gripper() {
         let mut coefficients = [[0.0; 2]; TERMS];
         // x = 0.3 + 0.1 left, y = 0.2 top x bottom, sides in units of 64 pixels from the middle.
         coefficients[0][0] = 0.3;
@@ -123,13 +127,24 @@ mod tests {
         let mut model = TargetModel::default();
         model.insert("stack", Stage::Place, map);
         let tracked = TrackedObjects { stage: Some(Stage::Place), bounds: [None, Some(bounds)] };
-        let target = model.target("stack", &tracked, [0.3, -0.4]).expect("a target");
+        let target = model.predict("stack", &tracked, Some([0.3, -0.4])).expect("a target");
         let near = |a: f32, b: f32| (a - b).abs() < 1e-6;
         assert!(near(target.offset[0], 0.1) && near(target.offset[1], 0.0), "{target:?}");
-        assert!(near(target.distance(&[0.1, 0.02, 9.0, 9.0, 9.0, 9.0, 1.0]), 0.02));
-        assert_eq!(model.target("other", &tracked, [0.0; 2]), None);
-        assert_eq!(model.target("stack", &TrackedObjects { stage: Some(Stage::Grasp), ..tracked }, [0.0; 2]), None);
-        coefficients[3][0] = f32::NAN;
-        assert!(TargetMap::new(coefficients).is_err());
+        assert!(near(target.distance([0.1, 0.02]), 0.02));
+        assert_eq!(model.predict("other", &tracked, Some([0.0; 2])), None);
+        assert_eq!(model.predict("stack", &tracked, None), None);
+        let grasping = TrackedObjects { stage: Some(Stage::Grasp), ..tracked };
+        assert_eq!(model.predict("stack", &grasping, Some([0.0; 2])), None);
+    }
+
+    #[test]
+    fn maps_out_of_reach_are_refused() {
+        for (coefficient, shown) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf"), (-3e38, "-3")] {
+            let mut coefficients = [[0.0; 2]; TERMS];
+            coefficients[3][0] = coefficient;
+            let error = TargetMap::new(coefficients).expect_err("refused").to_string();
+            let expected = format!("expected coefficients of at most 1000 m, got {shown}");
+            assert!(error.contains(&expected), "{error}");
+        }
     }
 }

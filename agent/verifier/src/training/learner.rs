@@ -4,11 +4,10 @@ use anyhow::ensure;
 use candle_core::{Device, Tensor, Var};
 use candle_nn::{Linear, Module};
 use rand::Rng;
-use rand::rngs::StdRng;
 
-use crate::verifier::{Layer, Network, Standardisation};
+use crate::{Layer, Network, Standardisation};
 
-/// Three affine layers whose weights an optimiser can change.
+/// Three affine layers whose weights an optimizer can change.
 pub struct Learner {
     variables: [(Var, Var); 3],
     layers: [Linear; 3],
@@ -54,7 +53,7 @@ impl Learner {
     pub fn new(
         input_size: usize,
         hidden_sizes: [usize; 2],
-        random: &mut StdRng,
+        random: &mut impl Rng,
     ) -> anyhow::Result<Learner> {
         let [first, second] = hidden_sizes;
         let mut layer = |inputs: usize, outputs: usize| -> candle_core::Result<(Var, Var)> {
@@ -66,14 +65,14 @@ impl Learner {
             Ok((Var::from_tensor(&weight)?, Var::from_tensor(&bias)?))
         };
         let variables = [layer(input_size, first)?, layer(first, second)?, layer(second, 1)?];
-        // A variable's tensor shares its storage, so the layers follow every step of the optimiser.
+        // A variable's tensor shares its storage, so the layers follow every step of the optimizer.
         let layers = variables.each_ref().map(|(weight, bias)| {
             Linear::new(weight.as_tensor().clone(), Some(bias.as_tensor().clone()))
         });
         Ok(Learner { variables, layers })
     }
 
-    /// All that the optimiser changes.
+    /// All that the optimizer changes.
     pub fn variables(&self) -> Vec<Var> {
         self.variables.iter().flat_map(|(weight, bias)| [weight.clone(), bias.clone()]).collect()
     }
@@ -119,8 +118,10 @@ fn cross_entropy(logits: &Tensor, labels: &Tensor) -> candle_core::Result<Tensor
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::verifier::weighted_loss;
     use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use crate::weighted_loss;
 
     /// Value and slope of the loss at one logit, against the formula in f64.
     fn check(logit: f32, label: f32) {
@@ -161,7 +162,7 @@ mod tests {
 
     #[test]
     fn tensors_and_plain_loops_agree() {
-        let mut random = StdRng::seed_from_u64(3);
+        let mut random = ChaCha8Rng::seed_from_u64(3);
         let rows: Vec<f32> = (0..40 * 6).map(|_| random.random_range(-3.0..5.0)).collect();
         let rows = || rows.chunks_exact(6);
         let labels: Vec<bool> = (0..40).map(|i| i % 3 == 0).collect();
