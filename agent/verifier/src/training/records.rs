@@ -95,7 +95,10 @@ fn record_of(path: &Path, label: &EpisodeOutcome) -> Result<EpisodeRecord, &'sta
         return Err("record of another run");
     }
     if outcome(&record) != *label {
-        tracing::warn!("excluded from training: the record {} disagrees with its label", path.display());
+        tracing::warn!(
+            "excluded from training: the record {} disagrees with its label",
+            path.display()
+        );
         return Err("record disagrees with its label");
     }
     Ok(record)
@@ -125,13 +128,9 @@ fn training_episode(
         let mut read = || -> anyhow::Result<(Option<Vec<f32>>, Option<DecisionSample>)> {
             let sample = match &decisions {
                 None => None,
-                Some(_) => decision_sample::read(
-                    decision,
-                    &step.state,
-                    before,
-                    &mut tracker,
-                    reader,
-                )?,
+                Some(_) => {
+                    decision_sample::read(decision, &step.state, before, &mut tracker, reader)?
+                }
             };
             Ok((executed(decision)?, sample))
         };
@@ -148,11 +147,7 @@ fn training_episode(
     let (identity, steps_total) = (&record.identity, record.steps.len());
     Ok(TrainingEpisode {
         name: format!("{}/{}", identity.run, identity.id()),
-        start: LayoutKey {
-            task: identity.task_id(),
-            layout: identity.layout,
-            seed: identity.seed,
-        },
+        start: LayoutKey { task: identity.task_id(), layout: identity.layout, seed: identity.seed },
         instruction: record.instruction.clone(),
         is_success: record.statistics.is_success,
         hidden,

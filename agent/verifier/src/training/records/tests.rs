@@ -182,7 +182,8 @@ fn what_is_not_eligible_is_refused_with_the_reason() {
 
 #[test]
 fn hidden_states_of_selected_candidates_are_not_used() {
-    for strategy in ["verifier", "medoid", "majority", "worst", "verifier+medoid", "oracle", "???"] {
+    for strategy in ["verifier", "medoid", "majority", "worst", "verifier+medoid", "oracle", "???"]
+    {
         let mut record = record(0);
         record.identity.strategy = strategy.to_owned();
         assert_eq!(
