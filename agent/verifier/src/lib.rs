@@ -24,7 +24,7 @@ mod metrics;
 pub mod training;
 
 pub use description::{
-    ReRankingGain, RankingEvidence, TrainingData, TrainingOptions, VerifierDescription,
+    RankingEvidence, ReRankingGain, TrainingData, TrainingOptions, VerifierDescription,
 };
 pub use metrics::{Discrimination, Metrics, PHASE_STEPS, ScoredSamples, weighted_loss};
 pub use network::{Layer, Network, Standardisation};

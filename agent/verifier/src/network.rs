@@ -5,7 +5,7 @@
 use anyhow::ensure;
 
 /// Largest absolute value of a hidden state: the largest 16-bit float, which is what records keep.
-const INPUT_MAX: f64 = 65_504.0;
+const INPUT_MAX: f32 = 65_504.0;
 
 /// A network in which some hidden state could make a larger sum is refused. Training makes sums of at most about 1e10;
 /// 32 bits end at 3e38.
@@ -175,7 +175,7 @@ impl Network {
         let Standardisation { mean, deviation } = &self.standardisation;
         let input = mean.iter().zip(deviation);
         let mut bounds: Vec<f64> = input
-            .map(|(mean, deviation)| (INPUT_MAX + f64::from(mean.abs())) / f64::from(*deviation))
+            .map(|(mean, deviation)| f64::from(INPUT_MAX + mean.abs()) / f64::from(*deviation))
             .collect();
         let mut largest = bounds.iter().copied().fold(0.0, f64::max);
         for layer in &self.layers {
@@ -198,6 +198,20 @@ impl Network {
     /// First hidden layer, second hidden layer, output.
     pub fn layers(&self) -> &[Layer; 3] {
         &self.layers
+    }
+
+    /// Refuses a hidden state that has no meaningful logit: of another length, or not of 16-bit floats. A number that
+    /// is none would not show in the logit, because the activation makes 0 of it.
+    pub fn check(&self, hidden: &[f32]) -> anyhow::Result<()> {
+        let (expected, got) = (self.input_size(), hidden.len());
+        ensure!(got == expected, "expected a hidden state of {expected} values, got {got}");
+        let strange = hidden.iter().find(|value| value.is_nan() || value.abs() > INPUT_MAX);
+        ensure!(
+            strange.is_none(),
+            "expected a hidden state of 16-bit floats, got {}",
+            strange.copied().unwrap_or_default()
+        );
+        Ok(())
     }
 
     /// The logit of one hidden state.

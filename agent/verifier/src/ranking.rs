@@ -8,9 +8,7 @@
 use std::ops::Range;
 
 use anyhow::ensure;
-use decision::{
-    ActionChunk, ActionSpace, Candidate, CandidateAction, STAGES, TAGS, distance_mean,
-};
+use decision::{ActionChunk, ActionSpace, Candidate, CandidateAction, STAGES, TAGS, distance_mean};
 
 use crate::target::{PredictedTarget, TargetModel};
 
@@ -221,11 +219,7 @@ mod tests {
         ActionSpace { scale: vec![0.1, 0.1, 0.1, 0.0, 0.1, 0.1, 2.0], gripper: Some(6) }
     }
 
-    fn candidate(
-        tokens: Vec<u32>,
-        actions: Vec<Vec<f32>>,
-        confidence: Vec<f32>,
-    ) -> Candidate {
+    fn candidate(tokens: Vec<u32>, actions: Vec<Vec<f32>>, confidence: Vec<f32>) -> Candidate {
         let actions = ActionChunk::new(actions).expect("finite");
         Candidate {
             tokens: Vec::new(),
@@ -246,7 +240,10 @@ mod tests {
     }
 
     fn malformed() -> Candidate {
-        Candidate { parsed: Err(Malformed::new("expected an action, got none")), ..moving(0.1, 500, 1.0) }
+        Candidate {
+            parsed: Err(Malformed::new("expected an action, got none")),
+            ..moving(0.1, 500, 1.0)
+        }
     }
 
     fn check(rows: &[Vec<f32>], index: usize, expected: [f32; 3]) {

@@ -92,8 +92,7 @@ impl Verifier {
         let well_formed: Vec<&Candidate> =
             candidates.iter().filter(|candidate| candidate.parsed.is_ok()).collect();
         for candidate in &well_formed {
-            let (expected, got) = (network.input_size(), candidate.hidden.len());
-            ensure!(got == expected, "expected a hidden state of {expected} values, got {got}");
+            network.check(&candidate.hidden)?;
         }
         let scores = match ranking {
             None => well_formed.iter().map(|candidate| network.logit(&candidate.hidden)).collect(),
@@ -105,10 +104,7 @@ impl Verifier {
                 return Ok(0.0);
             }
             let logit = scores.next().context("expected a score of every well-formed candidate")?;
-            ensure!(
-                logit.is_finite(),
-                "expected a finite score of candidate {index}, got {logit}"
-            );
+            ensure!(logit.is_finite(), "expected a finite score of candidate {index}, got {logit}");
             Ok(logit)
         };
         candidates.iter().enumerate().map(logit).collect()

@@ -1,76 +1,81 @@
-//! `rever train`: finished episodes become a verifier, with its held-out quality printed and kept in the file.
+//! `rever train`: trains a verifier on collected episodes; its held-out quality is printed and kept in its file.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use serde::Serialize;
-
-use super::episodes::policy_folder;
-use vla::{DeviceName, Vla};
-use store::record::write_whole;
+use decision::ActionSpace;
 use evaluation::table::aligned;
-use crate::training::records::{self, Reader};
-use verifier::training::{Epoch, LabelledEpisode, TrainingSet, train};
-use verifier::{Description, Discrimination, Gain, Metrics, Options, Verifier, Words};
 use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
+use serde::Serialize;
+use store::record::write_whole;
+use verifier::training::records::{self, CompletionReader, Excluded};
+use verifier::training::{Epoch, TrainingEpisode, TrainingSet, train};
+use verifier::{
+    Discrimination, Metrics, ReRankingGain, TrainingOptions, Verifier, VerifierDescription,
+};
+use vla::CompletionParser;
+
+use super::episodes::{FLEET_DEFAULT, policy_folder};
 
 /// How long to look for agents that follow the verifier before it is published to nobody yet.
 const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
 
-/// Train a verifier on finished episodes.
+/// Train a verifier on collected episodes.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Runs to learn from; every episode in them must be fit for it. Without any, the label store is used
+    /// Runs to train on; every episode in them must be eligible [default: the label store].
     runs: Vec<PathBuf>,
-    /// Label store to learn from; what is not fit to teach is set aside and counted
+    /// Label store to train on; episodes that are not eligible are excluded and counted.
     #[arg(long, default_value = "runs/labels.sqlite", conflicts_with = "runs")]
     labels: PathBuf,
-    /// Folder of the policy whose hidden states the records hold, instead of the one that comes with the program
+    /// Folder of the policy whose hidden states the records hold [default: the one that comes with rever].
     #[arg(long, value_name = "FOLDER")]
     policy: Option<PathBuf>,
-    /// Where to write the verifier
+    /// The verifier's file.
     #[arg(long, default_value = "verifier.safetensors")]
     out: PathBuf,
-    /// Seed of the split, the first weights and the order of samples
-    #[arg(long, default_value_t = Options::default().seed)]
+    /// Seed of the split, the first weights and the order of samples.
+    #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
-    /// Passes over the samples at most
-    #[arg(long, default_value_t = Options::default().epochs_max)]
+    /// Passes over the samples at most.
+    #[arg(long, default_value_t = TrainingOptions::default().epochs_max)]
     epochs: usize,
-    /// Sizes of the two hidden layers
-    #[arg(long, num_args = 2, value_delimiter = ',', default_values_t = Options::default().hidden_sizes)]
+    /// Sizes of the two hidden layers.
+    #[arg(long, num_args = 2, value_delimiter = ',', default_values_t = TrainingOptions::default().hidden_sizes)]
     hidden_sizes: Vec<usize>,
-    /// Step size of the optimiser
-    #[arg(long, default_value_t = Options::default().learning_rate)]
+    /// Step size of the optimizer.
+    #[arg(long, default_value_t = TrainingOptions::default().learning_rate)]
     learning_rate: f64,
-    /// Weight decay of the optimiser
-    #[arg(long, default_value_t = Options::default().weight_decay)]
+    /// Weight decay of the optimizer.
+    #[arg(long, default_value_t = TrainingOptions::default().weight_decay)]
     weight_decay: f64,
-    /// Share of the episodes of every task that is held out
-    #[arg(long, default_value_t = Options::default().held_out_share)]
+    /// Share of each task's initial layouts whose loss decides when training stops.
+    #[arg(long, default_value_t = TrainingOptions::default().validation_share)]
+    validation_share: f64,
+    /// Share of each task's initial layouts that is held out for the printed figures.
+    #[arg(long, default_value_t = TrainingOptions::default().held_out_share)]
     held_out_share: f64,
-    /// What the weights of the nearness to the target are multiplied by; 0 leaves the target out
-    #[arg(long, default_value_t = Options::default().aim_factor)]
-    aim_factor: f64,
-    /// Leave out the part that compares candidates: the paper's verifier
+    /// What the weights of the nearness to the target are multiplied by; 0 leaves the target out.
+    #[arg(long, default_value_t = TrainingOptions::default().target_factor)]
+    target_factor: f64,
+    /// Leave out the ranking of candidates: the paper's verifier.
     #[arg(long)]
     plain: bool,
-    /// Also write the figures to this file
-    #[arg(long)]
+    /// Also write the figures to this file.
+    #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Publish the verifier under this name to agents that follow it
+    /// Publish the verifier under this name to agents that follow it.
     #[arg(long, requires = "connect")]
     name: Option<String>,
-    /// Router or agent to publish through, as tcp/host:port
+    /// Router or agent to publish through, as tcp/HOST:PORT.
     #[arg(long, requires = "name")]
     connect: Vec<String>,
-    /// Who meets whom
-    #[arg(long, default_value = "local")]
+    /// Namespace: peers see each other only within the same fleet.
+    #[arg(long, default_value = FLEET_DEFAULT)]
     fleet: String,
-    /// After publishing, stay until Ctrl-C so that agents that start later get the verifier too
+    /// After publishing, stay until Ctrl-C so that agents that start later get the verifier too.
     #[arg(long, requires = "name")]
     keep_publishing: bool,
 }
@@ -84,9 +89,9 @@ struct ResultFile<'a> {
     path: &'a Path,
     /// Everything that the verifier says about itself.
     #[serde(flatten)]
-    description: &'a Description,
-    /// Episodes that were not used, by reason.
-    set_aside: &'a BTreeMap<&'static str, usize>,
+    description: &'a VerifierDescription,
+    /// Numbers of excluded episodes by reason.
+    excluded: &'a Excluded,
     /// From the first record read to the file written.
     wall_secs: f64,
 }
@@ -94,31 +99,19 @@ struct ResultFile<'a> {
 /// Trains, prints, writes, publishes.
 pub fn run(arguments: Arguments) -> Result<()> {
     let started = Instant::now();
-    let policy = policy_folder(arguments.policy.as_ref())?;
-    let policy = Policy::load(&policy, DeviceName::Cpu)?;
-    let action_scale = policy.action_scale();
-    let confidence =
-        |tokens: &[u32], log_probabilities: &[f32]| policy.confidence(tokens, log_probabilities);
-    let words = |tokens: &[u32]| Words::of(&policy.parse(tokens).ok()?.reasoning);
-    let reader = Reader {
-        policy: policy.digest(),
-        action_scale: &action_scale,
-        confidence: &confidence,
-        words: &words,
-    };
-    let (episodes, set_aside) = read(&arguments, reader)?;
+    let parser = CompletionParser::load(&policy_folder(arguments.policy.as_ref())?)?;
+    let action_space = parser.action_space();
+    let (episodes, excluded) = read(&arguments, &parser, &action_space)?;
     ensure!(
         !episodes.is_empty(),
-        "training: expected episodes, got none; set aside: {}",
-        counts(&set_aside)
+        "training: expected eligible episodes, got none; excluded: {}",
+        counts(&excluded)
     );
-    let set = TrainingSet::new(policy.hidden_size(), episodes)?;
-    eprintln!("{} episodes, {} set aside", set.episodes().len(), counts(&set_aside));
+    let set = TrainingSet::new(parser.hidden_size(), action_space.length(), episodes)?;
+    eprintln!("{} episodes, excluded: {}", set.episodes().len(), counts(&excluded));
     let options = options(&arguments)?;
-    let verifier = train(&set, policy.digest(), &options, |epoch| say(epoch, &options))?;
-    // A bare file name has no folder to write the temporary file into.
-    let path = Path::new(".").join(&arguments.out);
-    write_whole(&path, verifier.bytes())?;
+    let verifier = train(&set, parser.digest(), &options, |epoch| report(epoch, &options))?;
+    write(&arguments.out, verifier.bytes())?;
     print!("{}", table(&verifier));
     println!("written to {}", arguments.out.display());
     if let Some(json) = &arguments.json {
@@ -126,10 +119,10 @@ pub fn run(arguments: Arguments) -> Result<()> {
             verifier: verifier.digest(),
             path: &arguments.out,
             description: verifier.description(),
-            set_aside: &set_aside,
+            excluded: &excluded,
             wall_secs: started.elapsed().as_secs_f64(),
         };
-        write_whole(&Path::new(".").join(json), &serde_json::to_vec_pretty(&result)?)?;
+        write(json, &serde_json::to_vec_pretty(&result)?)?;
     }
     match &arguments.name {
         Some(name) => publish(&arguments, name, &verifier),
@@ -139,53 +132,66 @@ pub fn run(arguments: Arguments) -> Result<()> {
 
 fn read(
     arguments: &Arguments,
-    reader: Reader<'_>,
-) -> Result<(Vec<LabelledEpisode>, BTreeMap<&'static str, usize>)> {
+    parser: &CompletionParser,
+    action_space: &ActionSpace,
+) -> Result<(Vec<TrainingEpisode>, Excluded)> {
+    let reader = CompletionReader {
+        policy: parser.digest(),
+        action_space,
+        parse: &|tokens| parser.parse(tokens),
+        confidence: &|tokens, log_probabilities| parser.confidence(tokens, log_probabilities),
+    };
     if arguments.runs.is_empty() {
         return records::from_labels(&arguments.labels, reader);
     }
-    Ok((records::from_runs(&arguments.runs, reader)?, BTreeMap::new()))
+    Ok((records::from_runs(&arguments.runs, reader)?, Excluded::new()))
 }
 
-fn options(arguments: &Arguments) -> Result<Options> {
+/// Writes a whole file; a bare name has no folder to write the temporary file into.
+fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    write_whole(&Path::new(".").join(path), bytes)
+}
+
+fn options(arguments: &Arguments) -> Result<TrainingOptions> {
     let hidden_sizes = arguments.hidden_sizes.as_slice().try_into();
-    Ok(Options {
+    Ok(TrainingOptions {
         seed: arguments.seed,
         hidden_sizes: hidden_sizes.context("hidden sizes: expected two")?,
         epochs_max: arguments.epochs,
         learning_rate: arguments.learning_rate,
         weight_decay: arguments.weight_decay,
+        validation_share: arguments.validation_share,
         held_out_share: arguments.held_out_share,
-        choice: !arguments.plain,
-        aim_factor: arguments.aim_factor,
-        ..Options::default()
+        ranking: !arguments.plain,
+        target_factor: arguments.target_factor,
+        ..TrainingOptions::default()
     })
 }
 
-fn say(epoch: Epoch, options: &Options) {
-    let Epoch { epoch, training_loss, held_out_loss, is_best } = epoch;
+fn report(epoch: Epoch, options: &TrainingOptions) {
+    let Epoch { epoch, training_loss, validation_loss, is_best } = epoch;
     let mark = if is_best { ", best so far" } else { "" };
     let epochs_max = options.epochs_max;
     eprintln!(
-        "pass {epoch} of at most {epochs_max}: loss {training_loss:.4}, held out {held_out_loss:.4}{mark}"
+        "pass {epoch} of at most {epochs_max}: training loss {training_loss:.4}, validation loss {validation_loss:.4}{mark}"
     );
 }
 
 /// Reasons and their numbers in one line.
-fn counts(set_aside: &BTreeMap<&'static str, usize>) -> String {
-    if set_aside.is_empty() {
+fn counts(excluded: &Excluded) -> String {
+    if excluded.is_empty() {
         return "none".to_owned();
     }
-    set_aside
+    excluded
         .iter()
         .map(|(reason, count)| format!("{count} ({reason})"))
         .collect::<Vec<_>>()
         .join(", ")
 }
 
-/// What was learnt from what, and the held-out figures: per task first, because the pooled one misleads.
+/// What the verifier was trained on, and the held-out figures: per task first, because the pooled one misleads.
 fn table(verifier: &Verifier) -> String {
-    let Description { policy, evidence, held_out, .. } = verifier.description();
+    let VerifierDescription { policy, data, held_out, .. } = verifier.description();
     let mut rows = vec![
         ["held-out AUROC", "all steps", "first 10", "middle", "last 10"]
             .map(str::to_owned)
@@ -209,37 +215,41 @@ fn table(verifier: &Verifier) -> String {
             .concat(),
     );
     format!(
-        "verifier {} for policy {}\nfitted to {} episodes ({} successes, {} steps) in {} passes, held out {} ({} successes, {} steps)\n{}held-out loss {}, Brier score {}, calibration error {} ({} bins)\n",
+        "verifier {} for policy {}\nfitted to {} episodes ({} successes, {} steps) in {} passes, stopped by {} ({} successes), held out {} ({} successes, {} steps)\n{}held-out loss {}, Brier score {}, calibration error {} ({} bins)\n",
         short(verifier.digest()),
         short(policy),
-        evidence.training_episodes,
-        evidence.training_successes,
-        evidence.training_samples,
-        evidence.epochs,
-        evidence.held_out_episodes,
-        evidence.held_out_successes,
-        evidence.held_out_samples,
+        data.training_episodes,
+        data.training_successes,
+        data.training_samples,
+        data.epochs,
+        data.validation_episodes,
+        data.validation_successes,
+        data.held_out_episodes,
+        data.held_out_successes,
+        data.held_out_samples,
         aligned(&rows),
         figure(held_out.loss),
         figure(held_out.brier_score),
         figure(held_out.calibration_error),
         held_out.reliability.len(),
-    ) + &choice_text(verifier)
+    ) + &ranking_text(verifier)
 }
 
-/// What the choice part is worth beside the medoid, by decisions taken one at a time.
-fn choice_text(verifier: &Verifier) -> String {
-    let Some(choice) = &verifier.description().choice else {
-        return "no choice part: it takes `rever collect --candidates 5` and no --plain\n"
+/// The gain of the ranking beside that of the medoid, from re-ranking single decisions.
+fn ranking_text(verifier: &Verifier) -> String {
+    let Some(ranking) = &verifier.description().ranking else {
+        return "no ranking of candidates: it needs `rever collect --candidates 5` and no --plain\n"
             .to_owned();
     };
-    let gain = |gain: &Gain| format!("{:+.1} ± {:.1}", gain.points, gain.standard_error);
+    let gain = |gain: &ReRankingGain| {
+        format!("{:+.1} ± {:.1}", gain.percentage_points, gain.standard_error)
+    };
     format!(
-        "choosing, from {} episodes ({} decisions): changing one decision at a time would bring {} points in sum, the medoid {} (cross-fitted, ± one standard error)\n",
-        choice.episodes,
-        choice.decisions,
-        gain(&choice.gain),
-        gain(&choice.medoid_gain),
+        "ranking, from {} episodes ({} decisions): estimated gain from re-ranking single decisions {} percentage points, the medoid's {} (cross-fitted, ± one standard error)\n",
+        ranking.episodes,
+        ranking.decisions,
+        gain(&ranking.gain),
+        gain(&ranking.medoid_gain),
     )
 }
 
@@ -282,28 +292,36 @@ fn publish(arguments: &Arguments, name: &str, verifier: &Verifier) -> Result<()>
 
 #[cfg(test)]
 mod tests {
+    use decision::TaskId;
+    use verifier::training::LayoutKey;
+
     use super::*;
 
     /// Two tasks, of which only the first has failures.
     fn verifier() -> Verifier {
-        let episode = |number: usize| LabelledEpisode {
+        let episode = |number: usize| TrainingEpisode {
             name: format!("{number:02}"),
+            start: LayoutKey {
+                task: TaskId::default_of(if number < 20 { "mixed" } else { "easy" }),
+                layout: None,
+                seed: number as u64,
+            },
             instruction: String::new(),
-            task: if number < 20 { "mixed" } else { "easy" }.to_owned(),
             is_success: number >= 10,
             hidden: (0..40)
                 .map(|step| if number < 10 { step as f32 } else { -1.0 - step as f32 })
                 .collect(),
             steps: (0..40).collect(),
             steps_total: 40,
+            steps_max: 60,
             decisions: None,
         };
-        let set = TrainingSet::new(1, (0..30).map(episode)).expect("a whole set");
-        let options = Options {
+        let set = TrainingSet::new(1, 7, (0..30).map(episode)).expect("a whole set");
+        let options = TrainingOptions {
             hidden_sizes: [8, 4],
             epochs_max: 30,
             learning_rate: 1e-2,
-            ..Options::default()
+            ..TrainingOptions::default()
         };
         train(&set, &"cafe".repeat(16), &options, |_| ()).expect("a verifier")
     }
@@ -324,20 +342,15 @@ mod tests {
         assert_eq!(cells("mixed"), ["1.000"; 4], "{table}");
         assert_eq!(cells("mean of the tasks"), ["1.000"; 4], "{table}");
         assert!(table.contains("for policy cafecafecafe\n"), "{table}");
-        let fitted = "fitted to 24 episodes (16 successes, 960 steps) in ";
-        assert!(
-            table.contains(fitted)
-                && table.contains(" passes, held out 6 (4 successes, 240 steps)\n"),
-            "{table}"
-        );
+        let fitted = "fitted to 21 episodes (14 successes, 840 steps) in ";
+        let others = ", stopped by 3 (2 successes), held out 6 (4 successes, 240 steps)\n";
+        assert!(table.contains(fitted) && table.contains(others), "{table}");
     }
 
     #[test]
-    fn reasons_are_counted_in_words() {
-        assert_eq!(counts(&BTreeMap::new()), "none");
-        assert_eq!(
-            counts(&BTreeMap::from([("greedy", 3), ("no outcome", 1)])),
-            "3 (greedy), 1 (no outcome)"
-        );
+    fn exclusions_are_counted_by_reason() {
+        assert_eq!(counts(&Excluded::new()), "none");
+        let excluded = Excluded::from([("greedy", 3), ("no steps", 1)]);
+        assert_eq!(counts(&excluded), "3 (greedy), 1 (no steps)");
     }
 }

@@ -1,9 +1,7 @@
 //! What a decision was between: the candidates of one recorded step, as training sees them.
 
 use anyhow::{Context, ensure};
-use decision::{
-    Candidate, Malformed, ObjectTracker, Parsed, ReasoningFeatures, TrackedObjects,
-};
+use decision::{Candidate, Malformed, ObjectTracker, Parsed, ReasoningFeatures, TrackedObjects};
 use protocol::Statistics;
 use store::record::{CandidateRecord, DecisionRecord, hidden_from_bytes};
 

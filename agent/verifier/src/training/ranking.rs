@@ -83,8 +83,7 @@ impl Models {
     fn fit(episodes: &[RankingEpisode<'_>], options: &TrainingOptions) -> Result<Models> {
         let mut by_folds = BTreeMap::new();
         for (first, second) in (0..FOLDS).flat_map(|one| (one..FOLDS).map(move |two| (one, two))) {
-            let is_used =
-                |episode: &RankingEpisode<'_>| ![first, second].contains(&episode.fold);
+            let is_used = |episode: &RankingEpisode<'_>| ![first, second].contains(&episode.fold);
             let critic = Critic::fit(episodes, is_used, options.seed)?;
             by_folds.insert((first, second), (critic, target::fit(episodes, is_used)?));
         }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail, ensure};
 use decision::{ActionSpace, Malformed, ObjectTracker, Parsed};
 use protocol::{EpisodeOutcome, Statistics};
-use store::labels::{LabelStore, outcome};
+use store::labels;
 use store::record::{DecisionRecord, EpisodeRecord, hidden_from_bytes};
 use store::run::{record_path, recorded};
 
@@ -56,10 +56,8 @@ pub fn from_labels(
     path: &Path,
     reader: CompletionReader<'_>,
 ) -> anyhow::Result<(Vec<TrainingEpisode>, Excluded)> {
-    // Opening would make an empty store.
-    ensure!(path.is_file(), "label store {}: expected a file, got none", path.display());
     let (mut episodes, mut excluded) = (Vec::new(), Excluded::new());
-    for label in LabelStore::open(path)?.labels()? {
+    for label in labels::labels(path)? {
         let reason = match (exclude_label(&label.outcome, reader.policy), label.record) {
             (Some(reason), _) => reason.summary(),
             (None, None) => "record on another machine",
@@ -94,8 +92,11 @@ fn record_of(path: &Path, label: &EpisodeOutcome) -> Result<EpisodeRecord, &'sta
     if record.identity.run != label.run {
         return Err("record of another run");
     }
-    if outcome(&record) != *label {
-        tracing::warn!("excluded from training: the record {} disagrees with its label", path.display());
+    if labels::outcome(&record) != *label {
+        tracing::warn!(
+            "excluded from training: the record {} disagrees with its label",
+            path.display()
+        );
         return Err("record disagrees with its label");
     }
     Ok(record)
@@ -125,13 +126,9 @@ fn training_episode(
         let mut read = || -> anyhow::Result<(Option<Vec<f32>>, Option<DecisionSample>)> {
             let sample = match &decisions {
                 None => None,
-                Some(_) => decision_sample::read(
-                    decision,
-                    &step.state,
-                    before,
-                    &mut tracker,
-                    reader,
-                )?,
+                Some(_) => {
+                    decision_sample::read(decision, &step.state, before, &mut tracker, reader)?
+                }
             };
             Ok((executed(decision)?, sample))
         };
@@ -148,11 +145,7 @@ fn training_episode(
     let (identity, steps_total) = (&record.identity, record.steps.len());
     Ok(TrainingEpisode {
         name: format!("{}/{}", identity.run, identity.id()),
-        start: LayoutKey {
-            task: identity.task_id(),
-            layout: identity.layout,
-            seed: identity.seed,
-        },
+        start: LayoutKey { task: identity.task_id(), layout: identity.layout, seed: identity.seed },
         instruction: record.instruction.clone(),
         is_success: record.statistics.is_success,
         hidden,

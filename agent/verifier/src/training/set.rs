@@ -104,11 +104,7 @@ impl TrainingSet {
     }
 }
 
-fn check(
-    episode: &TrainingEpisode,
-    input_size: usize,
-    action_length: usize,
-) -> anyhow::Result<()> {
+fn check(episode: &TrainingEpisode, input_size: usize, action_length: usize) -> anyhow::Result<()> {
     let (values, samples) = (episode.hidden.len(), episode.steps.len());
     ensure!(
         values == samples * input_size,

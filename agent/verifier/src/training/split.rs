@@ -145,7 +145,10 @@ mod tests {
             let twins = episodes.iter().zip(&folds).filter(|(other, _)| other.start == one.start);
             assert!(twins.map(|(_, fold)| fold).all(|other| other == fold));
         }
-        assert_eq!((0..5).map(|fold| folds.iter().filter(|one| **one == fold).count()).max(), Some(24));
+        assert_eq!(
+            (0..5).map(|fold| folds.iter().filter(|one| **one == fold).count()).max(),
+            Some(24)
+        );
     }
 
     #[test]

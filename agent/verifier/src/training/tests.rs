@@ -54,11 +54,7 @@ fn synthetic(episodes: usize, signal: f32, seed: u64) -> Vec<TrainingEpisode> {
         let task = if number.is_multiple_of(2) { "even" } else { "odd" };
         TrainingEpisode {
             name: format!("episode {number}"),
-            start: LayoutKey {
-                task: TaskId::default_of(task),
-                layout: None,
-                seed: number as u64,
-            },
+            start: LayoutKey { task: TaskId::default_of(task), layout: None, seed: number as u64 },
             instruction: String::new(),
             is_success,
             hidden: steps.iter().flat_map(|_| row(&mut random)).collect(),

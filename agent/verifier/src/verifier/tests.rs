@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::*;
 use crate::{
-    FeatureLayout, Layer, Metrics, ReRankingGain, RankingEvidence, ScoredSamples, Standardisation,
+    FeatureLayout, Layer, Metrics, RankingEvidence, ReRankingGain, ScoredSamples, Standardisation,
     TERMS, TargetMap, TargetModel, TrainingData, TrainingOptions,
 };
 
@@ -20,9 +20,8 @@ fn space() -> ActionSpace {
 
 fn network(seed: u64) -> Network {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut values = |count: usize| -> Vec<f32> {
-        (0..count).map(|_| random.random_range(-1.0..1.0)).collect()
-    };
+    let mut values =
+        |count: usize| -> Vec<f32> { (0..count).map(|_| random.random_range(-1.0..1.0)).collect() };
     let layers = [
         Layer::new(values(20), values(4)),
         Layer::new(values(12), values(3)),
@@ -85,7 +84,10 @@ fn candidate(log_probability: f32, hidden: &[f32]) -> Candidate {
 }
 
 fn malformed(hidden: &[f32]) -> Candidate {
-    Candidate { parsed: Err(Malformed::new("expected an action, got none")), ..candidate(0.0, hidden) }
+    Candidate {
+        parsed: Err(Malformed::new("expected an action, got none")),
+        ..candidate(0.0, hidden)
+    }
 }
 
 /// Scores candidates; `change` what the request says beside them.
@@ -115,8 +117,7 @@ fn score(verifier: &Verifier, candidates: &[Candidate]) -> anyhow::Result<Vec<f3
 #[test]
 fn the_ranking_tells_candidates_apart_and_the_situation_is_that_of_the_mean() {
     // The second is malformed: its hidden state must not count.
-    let candidates =
-        [candidate(-2.0, &[0.1; 5]), malformed(&[9.0; 5]), candidate(-1.0, &[0.5; 5])];
+    let candidates = [candidate(-2.0, &[0.1; 5]), malformed(&[9.0; 5]), candidate(-1.0, &[0.5; 5])];
     let logits = score(&ranking(1), &candidates).expect("scores");
     let situation = network(1).logit(&[0.3; 5]);
     // Half a nat off the mean: 4 logits per probability x 0.25 x 0.5.
@@ -143,9 +144,8 @@ fn a_file_is_read_back_bit_for_bit() {
 #[test]
 fn a_broken_file_is_refused() {
     let bytes = plain(1).bytes().to_vec();
-    let refuse = |bytes: &[u8]| {
-        format!("{:#}", Verifier::from_bytes(bytes, "cafe").err().expect("refused"))
-    };
+    let refuse =
+        |bytes: &[u8]| format!("{:#}", Verifier::from_bytes(bytes, "cafe").err().expect("refused"));
     assert!(refuse(&bytes[..bytes.len() - 1]).starts_with("verifier file: expected safetensors"));
     assert!(
         refuse(&[bytes.clone(), vec![0]].concat())
@@ -206,13 +206,16 @@ fn candidates_that_cannot_be_scored_are_an_error() {
             refuse(&verifier, candidate(0.0, &[])),
             "expected a hidden state of 5 values, got 0"
         );
-        assert_eq!(
-            refuse(&verifier, candidate(0.0, &[f32::INFINITY; 5]))
-                .replace("-inf", "NaN")
-                .replace("inf", "NaN"),
-            "expected a finite score of candidate 0, got NaN"
-        );
+        for (value, shown) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf"), (7e4, "70000")] {
+            assert_eq!(
+                refuse(&verifier, candidate(0.0, &[0.0, 0.0, value, 0.0, 0.0])),
+                format!("expected a hidden state of 16-bit floats, got {shown}")
+            );
+        }
     }
+    let mut boundless = candidate(-1.0, &[0.0; 5]);
+    boundless.confidence[0] = f32::NEG_INFINITY;
+    assert_eq!(refuse(&ranking(1), boundless), "expected a finite score of candidate 0, got NaN");
     let shorter = ActionSpace { scale: vec![1.0; 6], gripper: None };
     let error = score_with(&ranking(1), &[candidate(0.0, &[0.0; 5])], &shorter, |_| ());
     assert_eq!(
@@ -227,8 +230,7 @@ fn candidates_that_cannot_be_scored_are_an_error() {
 fn a_row_does_not_depend_on_its_batch() {
     let candidates: Vec<Candidate> = (0..80)
         .map(|row| {
-            let hidden: Vec<f32> =
-                (0..5).map(|i| (row * 7 + i * 3) as f32 * 0.013 - 2.0).collect();
+            let hidden: Vec<f32> = (0..5).map(|i| (row * 7 + i * 3) as f32 * 0.013 - 2.0).collect();
             candidate(-1.0, &hidden)
         })
         .collect();
@@ -288,21 +290,17 @@ fn the_shipped_file_scores_as_it_did_when_it_was_shipped() {
             Some(Stage::Place),
             [0xc13d_127e, 0xc13d_1699, 0xc143_f6f2, 0, 0xc130_7326],
         ),
-        (
-            "unknown",
-            None,
-            [0xc114_ef6c, 0xc122_27f5, 0xc11f_1c08, 0xc118_4180, 0xc119_9c37],
-        ),
+        ("unknown", None, [0xc114_ef6c, 0xc122_27f5, 0xc11f_1c08, 0xc118_4180, 0xc119_9c37]),
     ];
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/bridge-small/verifier.safetensors");
+    let path =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/bridge-small/verifier.safetensors");
     let digest = "c606f4f2cd3ee3380cfde049f282760bb998cde1ae6e32de03be048f73846e58";
     let verifier = Verifier::load(&path, digest).expect("the shipped file");
     assert_eq!(
         verifier.digest(),
         "8d485a09b1d97891c8062deae4ba91ee676e4387646a5431bb1f9209d3e8bcd6"
     );
-    let space =
-        ActionSpace { scale: vec![0.05, 0.06, 0.07, 0.0, 0.2, 0.3, 2.0], gripper: Some(6) };
+    let space = ActionSpace { scale: vec![0.05, 0.06, 0.07, 0.0, 0.2, 0.3, 2.0], gripper: Some(6) };
     for (seed, (instruction, stage, expected)) in EXPECTED.into_iter().enumerate() {
         let mut numbers = Numbers(seed as u32 + 1);
         let mut candidates: Vec<Candidate> = (0..5).map(|_| numbers.candidate()).collect();
@@ -314,8 +312,7 @@ fn the_shipped_file_scores_as_it_did_when_it_was_shipped() {
             request.instruction = instruction;
             request.tracked = TrackedObjects { stage, bounds };
         });
-        let bits: Vec<u32> =
-            logits.expect("scores").iter().map(|logit| logit.to_bits()).collect();
+        let bits: Vec<u32> = logits.expect("scores").iter().map(|logit| logit.to_bits()).collect();
         assert_eq!(bits, expected, "{instruction}");
     }
 }

@@ -1,8 +1,9 @@
 //! Records of made-up episodes, eligible and not.
 
 use decision::{ActionChunk, Reasoning};
-use store::labels::Label;
+use store::labels::{Label, LabelStore};
 use store::plan::SeedRange;
+use store::provenance::Provenance;
 use store::record::{
     CandidateRecord, EpisodeIdentity, RECORD_VERSION, StepRecord, Versions, hidden_to_bytes,
 };
@@ -78,6 +79,7 @@ fn record(episode: u32) -> EpisodeRecord {
         },
         versions: Versions {
             rever: "0.0.0".to_owned(),
+            commit: "unknown".to_owned(),
             protocol: 1,
             simulator: "mujoco 3.8.0".to_owned(),
             policy: "cafe".to_owned(),
@@ -98,7 +100,9 @@ fn decision(record: &mut EpisodeRecord, index: usize) -> &mut DecisionRecord {
 fn write(folder: &Path, records: &[EpisodeRecord]) {
     std::fs::create_dir_all(folder.join("episodes")).expect("a folder");
     for record in records {
-        record.write(&record_path(folder, &record.identity.id())).expect("a record");
+        record
+            .write(&record_path(folder, &record.identity.id()), &Provenance::default())
+            .expect("a record");
     }
 }
 
@@ -182,7 +186,8 @@ fn what_is_not_eligible_is_refused_with_the_reason() {
 
 #[test]
 fn hidden_states_of_selected_candidates_are_not_used() {
-    for strategy in ["verifier", "medoid", "majority", "worst", "verifier+medoid", "oracle", "???"] {
+    for strategy in ["verifier", "medoid", "majority", "worst", "verifier+medoid", "oracle", "???"]
+    {
         let mut record = record(0);
         record.identity.strategy = strategy.to_owned();
         assert_eq!(
