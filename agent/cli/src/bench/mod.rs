@@ -10,9 +10,9 @@ mod throughput;
 mod torch;
 mod wire;
 
-pub use decision::{Comparison, DecisionBench, Report, Row, Setting};
+pub use decision::{DecisionBench, Report};
 pub use observations::read as read_observations;
-pub use simulators::{Row as SimulatorsRow, SimulatorsBench};
-pub use throughput::{Row as ThroughputRow, ThroughputBench};
+pub use simulators::SimulatorsBench;
+pub use throughput::ThroughputBench;
 pub use torch::Torch;
-pub use wire::{Row as WireRow, WireBench};
+pub use wire::WireBench;

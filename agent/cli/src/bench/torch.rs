@@ -71,7 +71,18 @@ impl Torch {
             )
         })?;
         ensure!(!hello.settings.is_empty(), "PyTorch: expected a setting that works, got none");
-        Ok(Torch { process, requests, replies, hello })
+        let torch = Torch { process, requests, replies, hello };
+        torch.signal(libc::SIGSTOP)?;
+        Ok(torch)
+    }
+
+    /// Stops or continues the process. PyTorch's threads spin on after their turn, on cores that ours is timed on.
+    fn signal(&self, signal: libc::c_int) -> Result<()> {
+        let process = libc::pid_t::try_from(self.process.id()).context("a process id is a pid")?;
+        // SAFETY: a plain system call; the process is a child of ours that nobody has waited for.
+        let result = unsafe { libc::kill(process, signal) };
+        ensure!(result == 0, "PyTorch's process has ended");
+        Ok(())
     }
 
     /// Milliseconds of one decision: prefill, then these tokens of each candidate, with logits and a draw each.
@@ -82,9 +93,12 @@ impl Torch {
         tokens: &[Vec<u32>],
     ) -> Result<f64> {
         let request = serde_json::to_string(&Request { setting, observation, tokens })?;
+        self.signal(libc::SIGCONT)?;
         writeln!(self.requests, "{request}").context("PyTorch's process has ended")?;
         self.requests.flush().context("PyTorch's process has ended")?;
-        Ok(read::<Answer>(&mut self.replies)?.ms)
+        let answer: Answer = read(&mut self.replies)?;
+        self.signal(libc::SIGSTOP)?;
+        Ok(answer.ms)
     }
 }
 

@@ -1,20 +1,23 @@
 //! `rever bench`: what the parts of the program cost on this machine.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::episodes::policy_folder;
-use crate::bench::{DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench, read_observations};
-use vla::{DeviceName, Vla};
 use runtime::setup;
 use runtime::simulator::Simulator;
 use runtime::site::Site;
 use verifier::Verifier;
+use vla::{DeviceName, Vla};
+
+use super::episodes::policy_folder;
+use crate::bench::{
+    DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench, read_observations,
+};
+use crate::build_info;
 
 /// What the parts of the program cost on this machine.
 #[derive(Debug, Args)]
@@ -143,20 +146,8 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Part::Wire(arguments) => wire(arguments),
         Part::Simulators(arguments) => simulators(arguments),
     }?;
-    println!("commit {}", commit());
+    println!("commit {}", build_info::build().commit_text());
     Ok(())
-}
-
-/// What was measured: the checkout's commit, `-dirty` when something in it differs.
-fn commit() -> String {
-    let describe = || -> Result<String> {
-        let mut git = Command::new("git");
-        git.args(["describe", "--always", "--dirty", "--abbrev=10"]);
-        let output = git.current_dir(setup::repository()?).output()?;
-        ensure!(output.status.success(), "no git checkout");
-        Ok(String::from_utf8(output.stdout)?.trim().to_owned())
-    };
-    describe().unwrap_or_else(|_| "unknown".to_owned())
 }
 
 fn wire(arguments: WireArguments) -> Result<()> {
@@ -244,12 +235,13 @@ fn site(servers: usize, simulator: Simulator, python: Option<PathBuf>) -> Site {
 
 fn throughput(arguments: ThroughputArguments) -> Result<()> {
     let folder = policy_folder(arguments.policy.as_ref())?;
-    let policy = Policy::load(&folder, arguments.device)?;
-    let verifier = Verifier::load(&folder.join("verifier.safetensors"), policy.digest())?;
+    let policy = Vla::load(&folder, arguments.device)?;
+    let file = folder.join("verifier.safetensors");
+    let verifier = Verifier::load(&file, policy.parser().digest())?;
     let site = site(usize::from(arguments.servers), arguments.simulator, arguments.python);
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
     let bench = ThroughputBench {
-        policy: &policy,
+        policy: Arc::new(policy),
         verifier: Arc::new(verifier),
         site: &site,
         sessions: &sessions,
@@ -279,9 +271,9 @@ fn throughput(arguments: ThroughputArguments) -> Result<()> {
     Ok(())
 }
 
-/// Writes an object of figures, with the commit.
+/// Writes an object of figures, with the build that measured them.
 fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
-    figures["commit"] = commit().into();
+    figures["commit"] = build_info::build().commit_text().into();
     let text = serde_json::to_string_pretty(&figures)?;
     std::fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
 }
@@ -294,11 +286,11 @@ fn decision(arguments: DecisionArguments) -> Result<()> {
     );
     let folder = policy_folder(arguments.policy.as_ref())?;
     let file = arguments.verifier.unwrap_or_else(|| folder.join("verifier.safetensors"));
-    let policy = Policy::load(&folder, arguments.device)?;
-    let verifier = Verifier::load(&file, policy.digest())?;
+    let policy = Vla::load(&folder, arguments.device)?;
+    let verifier = Verifier::load(&file, policy.parser().digest())?;
     let recorded = match arguments.observations {
         Some(file) => file,
-        None => setup::repository()?.join("agent/tests/fixtures/bridge-small.safetensors"),
+        None => setup::repository()?.join("agent/vla/tests/fixtures/bridge-small.safetensors"),
     };
     let observations = read_observations(&recorded)?;
     let torch = if arguments.compare {
@@ -310,11 +302,13 @@ fn decision(arguments: DecisionArguments) -> Result<()> {
     let progress = ProgressBar::new(u64::from(arguments.rounds) + 1);
     let style = "bench: {pos}/{len} rounds, {eta} left";
     progress.set_style(ProgressStyle::with_template(style).context("progress line")?);
+    let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
     let bench = DecisionBench {
-        policy: &policy,
-        verifier: &verifier,
+        policy: Arc::new(policy),
+        verifier: Arc::new(verifier),
         observations: &observations,
         rounds: arguments.rounds as usize,
+        runtime: &runtime,
     };
     let report = bench.run(torch, |round| progress.set_position(round as u64))?;
     progress.finish_and_clear();

@@ -17,7 +17,6 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 use store::labels::LabelStore;
 use store::plan::SeedRange;
-use store::record::Versions;
 use store::run::{self, Run, RunRequest};
 use tokio::runtime::Runtime;
 use verifier::Verifier;
