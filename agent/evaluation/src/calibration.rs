@@ -1,7 +1,7 @@
 //! Whether a score of 0.7 means success in seven of ten cases: reliability bins, calibration error, Brier score.
 //!
-//! The verifier is trained with class weights, so its probabilities are those of a balanced world: where successes are not half
-//! of all samples they are shifted by the odds of the classes. That moves no ranking, but it does show here.
+//! The verifier is trained with class weights, so its probabilities are those of balanced classes: where successes are not
+//! half of all samples they are shifted by the odds of the classes. That moves no ranking, but it does show here.
 
 /// Bins of the usual reliability diagram.
 pub const BINS: usize = 15;

@@ -132,7 +132,7 @@ fn headroom_is_the_share_of_the_gap_to_the_oracle_with_an_interval() {
 }
 
 /// What is simulated: tasks and starts, episodes of each start, rates of settings, and how much episodes have in common.
-struct World {
+struct Simulation {
     tasks: usize,
     starts: usize,
     repeats: usize,
@@ -144,7 +144,7 @@ struct World {
     likeness: f64,
 }
 
-impl World {
+impl Simulation {
     /// One run, a list of tasks for each setting.
     fn run(&self, random: &mut ChaCha8Rng) -> Vec<Vec<TaskClusters>> {
         let mut settings = vec![vec![Vec::new(); self.tasks]; self.rates.len()];
@@ -179,15 +179,15 @@ impl World {
     }
 }
 
-/// Every world with 1 or 4 tasks, 4 to 24 starts each, and the given rates.
-fn small_worlds(rates: &[&[f64]]) -> Vec<World> {
-    let mut worlds = Vec::new();
+/// All simulations with 1 or 4 tasks, 4 to 24 starts each, and the given rates.
+fn small_simulations(rates: &[&[f64]]) -> Vec<Simulation> {
+    let mut simulations = Vec::new();
     for tasks in [1, 4] {
         for starts in [4, 6, 12, 24] {
             for rates in rates {
                 for agreement in [0.0, 0.6, 0.9] {
                     let rates = rates.to_vec();
-                    worlds.push(World {
+                    simulations.push(Simulation {
                         tasks,
                         starts,
                         repeats: 1,
@@ -199,7 +199,7 @@ fn small_worlds(rates: &[&[f64]]) -> Vec<World> {
             }
         }
     }
-    worlds
+    simulations
 }
 
 fn mean_of(shares: &[f64]) -> f64 {
@@ -208,11 +208,12 @@ fn mean_of(shares: &[f64]) -> f64 {
 
 #[test]
 fn intervals_of_rates_hold_the_truth_in_95_of_100_runs() {
-    let worlds = small_worlds(&[&[0.5], &[0.7], &[0.9], &[0.1]]);
-    let shares: Vec<f64> = worlds
+    let simulations = small_simulations(&[&[0.5], &[0.7], &[0.9], &[0.1]]);
+    let shares: Vec<f64> = simulations
         .iter()
-        .map(|world| {
-            world.share(1, |run| Rate::over_tasks(&run[0]).interval.contains(world.rates[0]))
+        .map(|simulation| {
+            simulation
+                .share(1, |run| Rate::over_tasks(&run[0]).interval.contains(simulation.rates[0]))
         })
         .collect();
     let least = shares.iter().copied().fold(1.0, f64::min);
@@ -223,12 +224,12 @@ fn intervals_of_rates_hold_the_truth_in_95_of_100_runs() {
 
 #[test]
 fn intervals_of_gains_hold_the_truth_in_95_of_100_runs() {
-    let worlds = small_worlds(&[&[0.5, 0.5], &[0.9, 0.7], &[0.3, 0.1], &[0.7, 0.5]]);
-    let shares: Vec<f64> = worlds
+    let simulations = small_simulations(&[&[0.5, 0.5], &[0.9, 0.7], &[0.3, 0.1], &[0.7, 0.5]]);
+    let shares: Vec<f64> = simulations
         .iter()
-        .map(|world| {
-            let truth = world.rates[0] - world.rates[1];
-            world.share(2, |run| {
+        .map(|simulation| {
+            let truth = simulation.rates[0] - simulation.rates[1];
+            simulation.share(2, |run| {
                 let gain = gain(&run[0], &run[1]).expect("pairs");
                 // A gain of two rates may differ from the truth in its last bit.
                 gain.interval.low - 1e-9 <= truth && truth <= gain.interval.high + 1e-9
@@ -245,8 +246,9 @@ fn intervals_of_headroom_hold_the_truth_in_95_of_100_runs() {
     for starts in [6, 24] {
         for agreement in [0.0, 0.7] {
             let rates = vec![0.5, 0.7, 0.9];
-            let world = World { tasks: 4, starts, repeats: 1, rates, agreement, likeness: 0.0 };
-            let wrong = world.share(3, |run| {
+            let simulation =
+                Simulation { tasks: 4, starts, repeats: 1, rates, agreement, likeness: 0.0 };
+            let wrong = simulation.share(3, |run| {
                 let found = headroom(&run[0], &run[1], &run[2]).and_then(|found| found.interval);
                 found.is_some_and(|interval| !interval.contains(0.5))
             });
@@ -257,7 +259,7 @@ fn intervals_of_headroom_hold_the_truth_in_95_of_100_runs() {
 
 #[test]
 fn intervals_of_clustered_episodes_hold_the_truth_in_95_of_100_runs() {
-    let world = World {
+    let simulation = Simulation {
         tasks: 4,
         starts: 24,
         repeats: 3,
@@ -265,14 +267,15 @@ fn intervals_of_clustered_episodes_hold_the_truth_in_95_of_100_runs() {
         agreement: 0.3,
         likeness: 0.6,
     };
-    let rate = world.share(4, |run| Rate::over_tasks(&run[0]).interval.contains(0.8));
+    let rate = simulation.share(4, |run| Rate::over_tasks(&run[0]).interval.contains(0.8));
     assert!((0.93..0.975).contains(&rate), "{rate}");
     // The same episodes counted as if each had a start of its own.
-    let naive = world.share(4, |run| {
+    let naive = simulation.share(4, |run| {
         let value = Rate::over_tasks(&run[0]).value.expect("a rate");
         wilson(value, 4.0 * 24.0 * 3.0).contains(0.8)
     });
     assert!(naive < 0.88, "{naive}");
-    let gains = world.share(5, |run| gain(&run[0], &run[1]).expect("pairs").interval.contains(0.2));
+    let gains =
+        simulation.share(5, |run| gain(&run[0], &run[1]).expect("pairs").interval.contains(0.2));
     assert!((0.93..0.985).contains(&gains), "{gains}");
 }

@@ -21,7 +21,8 @@ pub struct Point {
 
 const WIDTH: f64 = 520.0;
 const HEIGHT: f64 = 320.0;
-const SERIES_MAX: usize = 6;
+/// Lines of one figure; more cannot be told apart.
+pub const SERIES_MAX: usize = 6;
 
 /// The figure, or nothing when no strategy ran with at least two numbers of candidates.
 pub fn figure(series: &[Series]) -> String {

@@ -195,13 +195,18 @@ fn candidates(results: &Results) -> String {
     }
     // A line needs a second number of candidates beside the single sample that all share.
     series.retain(|(_, _, one)| one.points.iter().filter(|point| point.candidates > 1).count() > 1);
+    let lines = series.len();
     let figure = curve::figure(&series.into_iter().map(|(_, _, one)| one).collect::<Vec<_>>());
     if figure.is_empty() {
         return figure;
     }
+    let left_out = match lines.saturating_sub(curve::SERIES_MAX) {
+        0 => String::new(),
+        count => format!(" {count} more lines are left out here; the table of results has them."),
+    };
     format!(
         "<p class=\"note\">Success at the last step, averaged over tasks, with 95 % intervals; one candidate is a \
-         single sample.</p>{figure}"
+         single sample.{left_out}</p>{figure}"
     )
 }
 
