@@ -4,6 +4,7 @@ mod bench;
 mod collect;
 mod conformance;
 mod demo;
+mod digest;
 mod doctor;
 mod episodes;
 mod evaluate;
@@ -34,6 +35,7 @@ enum Command {
     Collect(collect::Arguments),
     Train(train::Arguments),
     Report(report::Arguments),
+    Digest(digest::Arguments),
     Doctor(doctor::Arguments),
     Bench(bench::Arguments),
     Conformance(conformance::Arguments),
@@ -48,6 +50,7 @@ impl Program {
             Command::Collect(arguments) => collect::run(arguments),
             Command::Train(arguments) => train::run(arguments),
             Command::Report(arguments) => report::run(arguments),
+            Command::Digest(arguments) => digest::run(arguments),
             Command::Doctor(arguments) => doctor::run(arguments),
             Command::Bench(arguments) => bench::run(arguments),
             Command::Conformance(arguments) => conformance::run(arguments),
