@@ -92,7 +92,8 @@ pub async fn test(
     let mut descriptions = found.servers.into_values();
     let description = descriptions.find(|description| wanted(&description.server));
     let description = description.with_context(|| {
-        let reasons = found.undescribed.iter().map(|(id, reason)| format!("; server {id} {reason}"));
+        let reasons =
+            found.undescribed.iter().map(|(id, reason)| format!("; server {id} {reason}"));
         let reasons: String = reasons.collect();
         format!("no environment server found: check --connect and --fleet{reasons}")
     })?;

@@ -218,11 +218,7 @@ impl Talk {
     }
 
     /// A `Reset` of the task under test.
-    pub fn resetting(
-        &self,
-        layout: Option<u32>,
-        seed: u64,
-    ) -> impl FnOnce(u64) -> Request + use<> {
+    pub fn resetting(&self, layout: Option<u32>, seed: u64) -> impl FnOnce(u64) -> Request + use<> {
         let (task, variant) = (self.task.task.clone(), self.task.variant.clone());
         move |sequence| Request::Reset { sequence, task, variant, layout, seed }
     }

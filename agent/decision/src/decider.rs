@@ -82,7 +82,11 @@ impl Decider {
     ) -> Vec<Result<Decision, DecisionFault>> {
         let proposals = self.propose(&requests).await;
         let scored = self.score(&mut requests, proposals).await;
-        requests.iter_mut().zip(scored).map(|(request, scored)| self.choose(request, scored?)).collect()
+        requests
+            .iter_mut()
+            .zip(scored)
+            .map(|(request, scored)| self.choose(request, scored?))
+            .collect()
     }
 
     /// Proposals of all requests together; where that fails, of each alone, so that a request which the policy cannot
@@ -221,7 +225,8 @@ fn by_scorer(
     proposals: &[Result<Proposal, DecisionFault>],
 ) -> Vec<(Arc<dyn Scorer>, Vec<usize>)> {
     let mut groups: Vec<(Arc<dyn Scorer>, Vec<usize>)> = Vec::new();
-    for (index, request) in requests.iter().enumerate().filter(|(index, _)| proposals[*index].is_ok())
+    for (index, request) in
+        requests.iter().enumerate().filter(|(index, _)| proposals[*index].is_ok())
     {
         let Some(scorer) = &request.context.scorer else { continue };
         match groups.iter_mut().find(|(known, _)| Arc::ptr_eq(known, scorer)) {

@@ -45,6 +45,4 @@ pub use strategy::{
     distance_mean,
 };
 pub use task::{TaskId, VARIANT_DEFAULT};
-pub use tracker::{
-    BoundingBox, ObjectTracker, ReasoningFeatures, STAGES, Stage, TrackedObjects,
-};
+pub use tracker::{BoundingBox, ObjectTracker, ReasoningFeatures, STAGES, Stage, TrackedObjects};

@@ -117,16 +117,15 @@ impl Strategy {
         match self {
             Strategy::Greedy | Strategy::Sample => candidates.first()?.as_ref().map(|_| 0),
             Strategy::FirstWellFormed => candidates.iter().position(Option::is_some),
-            Strategy::Majority => {
-                largest(candidates, |index, own| votes(alternatives, index, own))
-            },
+            Strategy::Majority => largest(candidates, |index, own| votes(alternatives, index, own)),
             Strategy::Medoid => {
                 largest(candidates, |index, own| -distance_mean(candidates, index, own, space))
             }
             Strategy::Verifier => largest(candidates, |index, _| alternatives.logit(index)),
             Strategy::Worst => largest(candidates, |index, _| -alternatives.logit(index)),
             Strategy::VerifierMedoid => largest(candidates, |index, own| {
-                alternatives.logit(index) - MEDOID_WEIGHT_LOGITS * distance_mean(candidates, index, own, space)
+                alternatives.logit(index)
+                    - MEDOID_WEIGHT_LOGITS * distance_mean(candidates, index, own, space)
             }),
             Strategy::Oracle => {
                 let expert =

@@ -193,12 +193,14 @@ mod tests {
                 ..Reasoning::default()
             }
         };
-        let stage = |subtask| ReasoningFeatures::of(&reasoning(subtask, 2)).and_then(|said| said.stage);
+        let stage =
+            |subtask| ReasoningFeatures::of(&reasoning(subtask, 2)).and_then(|said| said.stage);
         assert_eq!(["reach the spoon", "grasp the spoon"].map(stage), [GRASP; 2]);
         assert_eq!(["lift the spoon", "move it", "release it"].map(stage), [PLACE; 3]);
         assert_eq!(stage("stay away"), None);
         assert_eq!(ReasoningFeatures::of(&reasoning("reach it", 1)), None);
-        let said = ReasoningFeatures::of(&reasoning("reach it", 3)).expect("two objects and one more");
+        let said =
+            ReasoningFeatures::of(&reasoning("reach it", 3)).expect("two objects and one more");
         assert_eq!(said.bounds, [[0.0, 2.0, 30.0, 4.0], [1.0, 2.0, 30.0, 4.0]]);
     }
 }

@@ -200,16 +200,9 @@ fn setting_result(
 }
 
 fn count(episodes: &TaskEpisodes<'_>, faults: &[&FaultRecord]) -> Counts {
-    let lost = faults.iter().filter(|fault| fault.never_acted).map(|fault| fault.identity.id());
-    let recorded = episodes.never_acted().iter().map(|summary| summary.identity.id());
-    let mut never_acted: BTreeSet<String> = lost.chain(recorded).collect();
-    // An episode that has an outcome after all is in the rates.
-    for summary in episodes.counted() {
-        never_acted.remove(&summary.identity.id());
-    }
     let mut counts = Counts {
         faults: faults.len() as u64,
-        never_acted: never_acted.len() as u64,
+        never_acted: episodes.never_acted().len() as u64,
         repeats: episodes.repeats(),
         ..Counts::default()
     };

@@ -143,8 +143,7 @@ impl Experiment {
         let successes = summaries.iter().filter(|one| one.statistics.is_success).count();
         let waiting = queue.progress().await?.waiting;
         let done = summaries.len() as u64;
-        let progress =
-            Progress::new(&self.title, done + waiting as u64, done, successes as u64);
+        let progress = Progress::new(&self.title, done + waiting as u64, done, successes as u64);
         let outcomes = OutcomePublisher::declare(network, &name).await?;
         let mut sinks: Vec<Box<dyn EventSink>> = Vec::new();
         if self.record.video {

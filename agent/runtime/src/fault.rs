@@ -99,14 +99,6 @@ pub enum AttemptFault {
     /// The policy or the scorer failed.
     #[error("{0}")]
     Decision(#[from] DecisionFault),
-    /// The policy never said anything that could be executed: what the robot did was not its doing.
-    #[error("no candidate of {decisions} decisions was well formed; the first: {reason}")]
-    NeverActed {
-        /// Decisions of the episode.
-        decisions: usize,
-        /// What was expected and what came.
-        reason: String,
-    },
     /// The rollout ended meanwhile.
     #[error("stopped")]
     Stopped,
@@ -125,7 +117,7 @@ impl AttemptFault {
                 | EnvironmentFault::Wire { .. } => FaultScope::Server,
                 EnvironmentFault::LinkLost { .. } => FaultScope::Link,
             },
-            AttemptFault::Decision(_) | AttemptFault::NeverActed { .. } => FaultScope::Episode,
+            AttemptFault::Decision(_) => FaultScope::Episode,
             AttemptFault::Stopped => FaultScope::Link,
         }
     }

@@ -37,6 +37,7 @@ mod tests {
     pub fn versions() -> Versions {
         Versions {
             rever: "0.0.0".to_owned(),
+            commit: String::new(),
             protocol: protocol::PROTOCOL_VERSION,
             simulator: String::new(),
             policy: String::new(),

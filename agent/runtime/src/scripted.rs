@@ -12,9 +12,7 @@ use protocol::{
 use tokio::sync::watch;
 
 use crate::fault::EnvironmentFault;
-use crate::session::{
-    Environment, Episode, Session, SessionInfo, SessionPool, SessionRequest,
-};
+use crate::session::{Environment, Episode, Session, SessionInfo, SessionPool, SessionRequest};
 
 /// Control steps of every scripted episode.
 pub const STEPS_MAX: u32 = 3;
@@ -222,12 +220,8 @@ fn observation(instruction: &str) -> Observation {
 
 fn description(task: &str) -> TaskDescription {
     let names = ["x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "gripper"];
-    let dimension = |name: &str| Dimension {
-        name: name.to_owned(),
-        low: None,
-        high: None,
-        discrete: false,
-    };
+    let dimension =
+        |name: &str| Dimension { name: name.to_owned(), low: None, high: None, discrete: false };
     TaskDescription {
         task: task.to_owned(),
         variant: "default".to_owned(),

@@ -90,5 +90,4 @@ pub trait SessionPool: Send + Sync + 'static {
 
     /// Takes note that a session is gone, and that its server may be.
     fn lost(&self, info: &SessionInfo, fault: &EnvironmentFault);
-
 }

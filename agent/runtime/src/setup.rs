@@ -64,8 +64,10 @@ impl PythonEnvironment {
 
 /// The checkout that this program was built from.
 pub fn repository() -> Result<PathBuf> {
-    let repository =
-        Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).context("the crate has no parent folder")?;
+    let repository = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .ancestors()
+        .nth(2)
+        .context("the crate has no parent folder")?;
     ensure!(
         repository.is_dir(),
         "rever was built from {}, which is no longer there: build it again",

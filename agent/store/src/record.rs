@@ -125,6 +125,12 @@ impl EpisodeRecord {
         self.steps.iter().filter_map(|step| step.decision.as_ref())
     }
 
+    /// Whether the episode has an outcome: where no candidate was ever well formed, what the robot did was not the policy's
+    /// doing.
+    pub fn has_outcome(&self) -> bool {
+        self.decisions().any(|decision| decision.chosen.is_some())
+    }
+
     /// The mean of the chosen candidates' scores; none without a scorer or without any choice.
     pub fn score_mean(&self) -> Option<f32> {
         let chosen = self

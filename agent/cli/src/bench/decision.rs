@@ -127,7 +127,8 @@ impl DecisionBench<'_> {
             let is_counted = round >= WARM_UP_ROUNDS;
             for (index, observation) in self.observations.iter().enumerate() {
                 for (which, setting) in settings.iter().enumerate() {
-                    let (ms, tokens) = self.decide(&decider, observation, *setting, round as u64)?;
+                    let (ms, tokens) =
+                        self.decide(&decider, observation, *setting, round as u64)?;
                     if is_counted {
                         ours[which].add(ms, tokens.iter().map(Vec::len).sum());
                     }
@@ -282,8 +283,8 @@ fn sampled(candidates: usize) -> Setting {
 mod tests {
     use super::*;
     use crate::bench::read_observations;
-    use vla::DeviceName;
     use std::path::Path;
+    use vla::DeviceName;
 
     #[test]
     fn every_setting_is_timed_on_every_observation() {

@@ -105,8 +105,7 @@ impl ThroughputBench<'_> {
         let counts = progress.counts();
         let (_never, stop) = watch::channel(Stop::No);
         let outcomes = OutcomePublisher::declare(&deployment.network, &name).await?;
-        let (_newer, scorer) =
-            watch::channel(Some(Arc::clone(&self.verifier) as Arc<dyn Scorer>));
+        let (_newer, scorer) = watch::channel(Some(Arc::clone(&self.verifier) as Arc<dyn Scorer>));
         let policy = Arc::clone(&self.policy) as Arc<dyn Policy>;
         let pool = pool_options(policy.info(), name, None);
         let rollout = Rollout {

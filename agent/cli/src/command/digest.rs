@@ -31,7 +31,11 @@ pub fn run(arguments: Arguments) -> Result<()> {
         }
         digests.push(digest);
     }
-    ensure!(!digests.is_empty(), "{}: expected recorded episodes, got none", arguments.run.display());
+    ensure!(
+        !digests.is_empty(),
+        "{}: expected recorded episodes, got none",
+        arguments.run.display()
+    );
     let count = digests.len();
     println!("{} {count} episodes", combined_digest(digests));
     Ok(())

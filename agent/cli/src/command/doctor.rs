@@ -9,15 +9,15 @@ use protocol::{Open, PROTOCOL_VERSION, Reset};
 use serde::Serialize;
 
 use super::episodes::policy_folder;
-use vla::{DeviceName, Vla};
+use decision::{ActionSpace, Policy};
 use decision::{Image, ProposalRequest};
 use runtime::setup::{self, PythonEnvironment};
 use runtime::simulator::{ServerProgram, Simulator};
 use runtime::site::Site;
-use store::plan::SeedRange;
-use decision::{ActionSpace, Policy};
-use verifier::Verifier;
 use runtime::wire::{Environment, Network, ServerDescription};
+use store::plan::SeedRange;
+use verifier::Verifier;
+use vla::{DeviceName, Vla};
 
 /// A server must be seen within this time of its start.
 const SERVER_WAIT: Duration = Duration::from_secs(30);

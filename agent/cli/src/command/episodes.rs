@@ -10,9 +10,9 @@ use evaluation::results::{Results, tasks_in_order};
 use evaluation::suite::{Layouts, Suite};
 use runtime::experiment::{self, Ending, Experiment, LoadScorer};
 use runtime::rollout::RecordOptions;
+use runtime::setup;
 use runtime::simulator::Simulator;
 use runtime::site::{Deployment, Site};
-use runtime::setup;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 use store::labels::LabelStore;
@@ -151,8 +151,7 @@ impl EpisodesArguments {
         let digest = policy.parser().digest().to_owned();
         let verifier = self.verifier(&folder, &digest)?;
         self.check(&request, verifier.as_deref())?;
-        let runtime =
-            tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+        let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
         let (tasks, deployment) = self.tasks(&runtime)?;
         let suite = Suite {
             tasks,

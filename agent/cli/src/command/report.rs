@@ -7,9 +7,9 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::episodes::policy_folder;
-use vla::CompletionParser;
 use evaluation::report::{self, Report, ReportOptions, Speech};
 use store::run;
+use vla::CompletionParser;
 
 /// Episodes whose steps are written unless told otherwise: some 100 MB at the most.
 pub const EPISODES_MAX: usize = 1000;

@@ -10,12 +10,8 @@ use crate::{Setting, Strategy};
 
 fn dimensions() -> Vec<Dimension> {
     let names = ["x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "gripper"];
-    let dimension = |name: &str| Dimension {
-        name: name.to_owned(),
-        low: None,
-        high: None,
-        discrete: false,
-    };
+    let dimension =
+        |name: &str| Dimension { name: name.to_owned(), low: None, high: None, discrete: false };
     names.map(dimension).to_vec()
 }
 
@@ -69,10 +65,10 @@ async fn the_scorer_ranks_and_the_chosen_candidate_is_executed() {
 
 #[tokio::test]
 async fn a_robot_without_a_well_formed_candidate_holds_still_with_its_last_gripper_command() {
-    let policy = Arc::new(ScriptedPolicy::new().with(
-        "go",
-        [motions(&[None]), motions(&[Some(0.2)]), motions(&[None])],
-    ));
+    let policy = Arc::new(
+        ScriptedPolicy::new()
+            .with("go", [motions(&[None]), motions(&[Some(0.2)]), motions(&[None])]),
+    );
     let mut contexts = [context(Strategy::Medoid, "go", None)];
     let mut actions = Vec::new();
     for _ in 0..3 {
@@ -108,8 +104,7 @@ async fn a_request_that_the_policy_cannot_answer_costs_no_other_its_decision() {
 #[tokio::test]
 async fn a_scorer_that_fails_is_a_fault_of_its_episode_alone() {
     let policy = Arc::new(ScriptedPolicy::new());
-    let scorer: Arc<dyn Scorer> =
-        Arc::new(ScriptedScorer::new("far", 1.0).failing_for("unlucky"));
+    let scorer: Arc<dyn Scorer> = Arc::new(ScriptedScorer::new("far", 1.0).failing_for("unlucky"));
     let mut contexts = [
         context(Strategy::Verifier, "lucky", Some(Arc::clone(&scorer))),
         context(Strategy::Verifier, "unlucky", Some(Arc::clone(&scorer))),
@@ -132,9 +127,8 @@ async fn a_score_that_is_no_number_is_a_fault_and_not_a_choice() {
 
 #[tokio::test]
 async fn a_decision_does_not_depend_on_the_episodes_beside_it() {
-    let policy = || {
-        Arc::new(ScriptedPolicy::new().with("go", [motions(&[Some(0.1), Some(0.4), None])]))
-    };
+    let policy =
+        || Arc::new(ScriptedPolicy::new().with("go", [motions(&[Some(0.1), Some(0.4), None])]));
     let scorer: Arc<dyn Scorer> = Arc::new(ScriptedScorer::new("far", 1.0));
     let make = || context(Strategy::Verifier, "go", Some(Arc::clone(&scorer)));
     let alone = decide(policy(), &mut [make()]).await.remove(0);

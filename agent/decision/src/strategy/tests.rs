@@ -20,12 +20,7 @@ fn at(bin: u32, gripper: f32) -> Owned {
     owned(tokens, [bin as f32 * 1e-4, 0.0, 0.0, 0.0, 0.0, 0.0, gripper])
 }
 
-fn check(
-    strategy: &str,
-    candidates: &[Owned],
-    logits: &[f32],
-    expected: Option<usize>,
-) {
+fn check(strategy: &str, candidates: &[Owned], logits: &[f32], expected: Option<usize>) {
     let expert_action = [0.0502, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
     let borrowed: Vec<_> = candidates
         .iter()

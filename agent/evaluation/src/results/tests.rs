@@ -76,14 +76,13 @@ fn made_up() -> Vec<EpisodeSummary> {
     all
 }
 
-fn fault(strategy: Strategy, episode: u32, attempt: u32, never_acted: bool) -> FaultRecord {
+fn fault(strategy: Strategy, episode: u32, attempt: u32) -> FaultRecord {
     FaultRecord {
         identity: identity(&TaskId::default_of(TASKS[0]), episode, setting(strategy)),
         attempt,
         server: "s".into(),
         scope: FaultScope::Server,
         reason: "lost".into(),
-        never_acted,
     }
 }
 
@@ -125,20 +124,14 @@ fn times_are_those_of_one_decision_with_the_size_of_its_batch() {
 #[test]
 fn faults_and_episodes_without_any_action_are_counted_and_change_no_rate() {
     let mut summaries = made_up();
-    // As a record of a policy that never acted would be; the runtime makes it a fault.
     let mut held = summary(TASKS[0], 8, Strategy::Sample, false);
     (held.held_steps, held.malformed) = (2, 2);
     summaries.push(held);
-    let faults = [
-        fault(Strategy::Sample, 7, 1, false),
-        fault(Strategy::Sample, 6, 1, true),
-        fault(Strategy::Sample, 6, 2, true),
-    ];
+    let faults = [fault(Strategy::Sample, 7, 1), fault(Strategy::Sample, 6, 1)];
     let results = Results::new(&summaries, &faults, &order()).expect("results");
     let [sample, other] = [&results.settings[0].tasks[0], &results.settings[0].tasks[1]];
     assert_eq!((sample.success.value, sample.success.episodes), (Some(0.25), 4));
-    // Two attempts at one episode are one episode; the recorded one is another.
-    assert_eq!((sample.counts.faults, sample.counts.never_acted), (3, 2));
+    assert_eq!((sample.counts.faults, sample.counts.never_acted), (2, 1));
     assert_eq!((other.counts.faults, other.counts.never_acted), (0, 0));
     assert_eq!(results.counted.len(), 24);
 }

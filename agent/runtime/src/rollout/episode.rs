@@ -3,9 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use decision::{
-    Candidate, Decision, EpisodeContext, Observation, PolicyInfo, Scorer, probability,
-};
+use decision::{Candidate, Decision, EpisodeContext, Observation, PolicyInfo, Scorer, probability};
 use protocol::{Reset, TaskDescription};
 use store::queue::Lease;
 use store::record::{
@@ -99,15 +97,6 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
         while !progress.is_over {
             progress = self.step(episode, info, progress).await?;
         }
-        let mut decisions = progress.steps.iter().filter_map(|step| step.decision.as_ref());
-        if decisions.clone().all(|decision| decision.chosen.is_none()) {
-            let first = decisions.next().and_then(|decision| decision.candidates.first());
-            let reason = first.and_then(|candidate| candidate.malformed.clone());
-            return Err(AttemptFault::NeverActed {
-                decisions: progress.steps.len(),
-                reason: reason.unwrap_or_else(|| "no decision was made".to_owned()),
-            });
-        }
         Ok(progress)
     }
 
@@ -159,16 +148,12 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
     async fn emit_frame(&self, seen: &Observation, is_first: bool) -> Result<(), AttemptFault> {
         let id = self.lease.job.identity.id();
         let image = self.options.video.then(|| seen.image.clone());
-        let event = if is_first { Event::Started { id, image } } else { Event::Stepped { id, image } };
+        let event =
+            if is_first { Event::Started { id, image } } else { Event::Stepped { id, image } };
         self.sinks.emit(event).await.map_err(|_| AttemptFault::Stopped)
     }
 
-    fn record(
-        &self,
-        progress: Progress,
-        info: &SessionInfo,
-        started: Instant,
-    ) -> EpisodeRecord {
+    fn record(&self, progress: Progress, info: &SessionInfo, started: Instant) -> EpisodeRecord {
         let Progress { context, steps, .. } = progress;
         EpisodeRecord {
             version: RECORD_VERSION,

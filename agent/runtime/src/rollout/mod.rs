@@ -19,7 +19,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use anyhow::{Context, Result};
 use decision::{Decider, Scorer};
 use store::queue::{Disposition, EpisodeQueue, Lease};
-use store::record::Versions;
+use store::record::{EpisodeRecord, Versions};
 use store::run::FaultRecord;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
@@ -155,6 +155,9 @@ impl<P: SessionPool> Shared<P> {
         let info = session.info.clone();
         match self.attempt(&lease, session).await {
             Ok((record, environment)) => {
+                if !record.has_outcome() {
+                    sinks.emit(Event::Notice(never_acted(&record))).await?;
+                }
                 sinks.record(record).await?;
                 pool.release(Session { info, environment });
                 queue.complete(lease).await
@@ -167,7 +170,7 @@ impl<P: SessionPool> Shared<P> {
         &self,
         lease: &Lease,
         session: Session<P::Environment>,
-    ) -> Result<(store::record::EpisodeRecord, P::Environment), AttemptFault> {
+    ) -> Result<(EpisodeRecord, P::Environment), AttemptFault> {
         let run = EpisodeRun {
             lease,
             options: self.rollout.options,
@@ -182,13 +185,17 @@ impl<P: SessionPool> Shared<P> {
         run.run(session).await
     }
 
-    async fn note_fault(&self, lease: Lease, info: &SessionInfo, fault: AttemptFault) -> Result<()> {
+    async fn note_fault(
+        &self,
+        lease: Lease,
+        info: &SessionInfo,
+        fault: AttemptFault,
+    ) -> Result<()> {
         let record = FaultRecord {
             identity: lease.job.identity.clone(),
             attempt: lease.job.attempt,
             server: info.server.clone(),
             scope: fault.scope(),
-            never_acted: matches!(fault, AttemptFault::NeverActed { .. }),
             reason: fault.to_string(),
         };
         let id = record.identity.id();
@@ -200,6 +207,18 @@ impl<P: SessionPool> Shared<P> {
         }
         Ok(())
     }
+}
+
+/// What to say of an episode in which the robot held still from beginning to end.
+fn never_acted(record: &EpisodeRecord) -> String {
+    let decisions = record.decisions().count();
+    let first = record.decisions().flat_map(|decision| &decision.candidates).next();
+    let reason = first.and_then(|candidate| candidate.malformed.as_deref()).unwrap_or("none");
+    format!(
+        "{}: {decisions} of {decisions} decisions held: the policy never acted, so this episode has no outcome; its first \
+         candidate: {reason}",
+        record.identity.id()
+    )
 }
 
 /// Counts an episode as running until it is dropped.

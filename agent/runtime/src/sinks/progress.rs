@@ -152,7 +152,10 @@ impl EventSink for Progress {
             Event::Stepped { .. } => self.stepped(),
             Event::Recorded(record) => {
                 self.running = self.running.saturating_sub(1);
-                self.recorded(record.statistics.is_success, record.steps.len());
+                self.recorded(
+                    record.has_outcome() && record.statistics.is_success,
+                    record.steps.len(),
+                );
             }
             Event::Faulted(fault) => {
                 self.running = self.running.saturating_sub(1);

@@ -113,9 +113,9 @@ impl Discovery {
                 let is_due = retries.get(server).is_none_or(|(due, _)| *due <= Instant::now());
                 if is_due && !described.contains_key(server) && asking.insert(server.clone()) {
                     let (session, keys, server) = (session.clone(), keys.clone(), server.clone());
-                    asked.spawn(async move {
-                        (server.clone(), describe(session, keys, server).await)
-                    });
+                    asked.spawn(
+                        async move { (server.clone(), describe(session, keys, server).await) },
+                    );
                 }
             }
             let due = retries.iter().filter(|(server, _)| !asking.contains(*server));

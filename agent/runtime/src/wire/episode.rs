@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use protocol::{Observation, Reply, Request, Transition};
 
-use super::environment::unexpected;
 use super::Environment;
+use super::environment::unexpected;
 use crate::fault::EnvironmentFault;
 use crate::session;
 
@@ -38,10 +38,7 @@ impl Episode {
     }
 
     /// One control step.
-    pub async fn step(
-        &mut self,
-        action: &[f32],
-    ) -> Result<Transition, EnvironmentFault> {
+    pub async fn step(&mut self, action: &[f32]) -> Result<Transition, EnvironmentFault> {
         let request = |sequence| Request::Step { sequence, action: action.to_vec() };
         match self.environment.ask("Step", request).await? {
             Reply::Stepped { mut transition, changed_tiles, simulator_us, .. } => {

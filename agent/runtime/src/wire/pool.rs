@@ -88,7 +88,11 @@ struct Chosen {
 
 impl ZenohPool {
     /// A pool on a network; `local` are the servers that were started here.
-    pub fn new(network: Network, local: Option<Arc<LocalServers>>, options: PoolOptions) -> ZenohPool {
+    pub fn new(
+        network: Network,
+        local: Option<Arc<LocalServers>>,
+        options: PoolOptions,
+    ) -> ZenohPool {
         let fleet = network.fleet();
         let state = State { simulator: options.simulator.clone(), ..State::default() };
         ZenohPool { network, local, options, fleet, state: Mutex::new(state), freed: Notify::new() }

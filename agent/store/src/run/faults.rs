@@ -26,8 +26,6 @@ pub struct FaultRecord {
     pub scope: FaultScope,
     /// What happened.
     pub reason: String,
-    /// Whether the episode ran to its end without one well-formed candidate: the policy never acted.
-    pub never_acted: bool,
 }
 
 /// All attempts of a run that broke. Lines that cannot be read are left out with a warning: nothing is derived from faults but

@@ -21,12 +21,16 @@ const DAMAGED_SUFFIX: &str = ".damaged";
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Entry {
     pub summary: EpisodeSummary,
-    pub label: Label,
+    /// None where the episode has no outcome: the policy never acted.
+    pub label: Option<Label>,
 }
 
 impl Entry {
     pub fn new(record: &EpisodeRecord, path: &Path) -> Entry {
-        Entry { summary: EpisodeSummary::from(record), label: Label::new(record, path) }
+        Entry {
+            summary: EpisodeSummary::from(record),
+            label: record.has_outcome().then(|| Label::new(record, path)),
+        }
     }
 
     /// Reads a record and checks that it is the episode of its name.

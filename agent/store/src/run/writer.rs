@@ -176,7 +176,7 @@ impl Run {
             index::insert(&self.connection, &entry.summary)?;
         }
         if let Some(path) = &self.labels {
-            let expected: Vec<_> = entries.into_iter().map(|entry| entry.label).collect();
+            let expected: Vec<_> = entries.into_iter().filter_map(|entry| entry.label).collect();
             let labels::Corrections { changed, removed } =
                 labels::reconcile(&self.connection, &self.header.run, &self.folder, &expected)?;
             if changed + removed > 0 {
@@ -196,8 +196,8 @@ impl Run {
         let transaction = self.begin()?;
         for entry in entries {
             index::insert(&self.connection, &entry.summary)?;
-            if self.labels.is_some() {
-                labels::insert(&self.connection, &entry.label)?;
+            if let (Some(_), Some(label)) = (&self.labels, &entry.label) {
+                labels::insert(&self.connection, label)?;
             }
         }
         transaction.commit().with_context(|| self.databases())

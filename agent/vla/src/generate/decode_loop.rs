@@ -10,8 +10,8 @@ use rayon::prelude::*;
 
 use crate::checkpoint::actions::ActionBins;
 use crate::checkpoint::parse::is_complete;
-use crate::network::forward::{Context, Network};
 use crate::generate::sampling::{Draw, Stream, draw};
+use crate::network::forward::{Context, Network};
 
 /// Positions of a tail to make room for at once; tails grow beyond it when they must.
 const TAIL_CAPACITY: usize = 64;

@@ -9,8 +9,8 @@ use std::thread;
 use anyhow::{Context as _, Result, anyhow};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
-use crate::kernels::backend::Backend;
 use crate::generate::decode_loop::{Completion, Continuation, Limits, complete};
+use crate::kernels::backend::Backend;
 use crate::network::forward::Network;
 
 /// Minimum batch of a pool: below it, re-reading the weights dominates.

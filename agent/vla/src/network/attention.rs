@@ -9,8 +9,8 @@ use candle_core::{D, Result, Tensor};
 use rayon::prelude::*;
 
 use crate::kernels::backend::{Backend, Values};
-use crate::network::rotary::HeadShape;
 use crate::kernels::segment::{Segment, Visible, attend_row};
+use crate::network::rotary::HeadShape;
 
 /// Query rows per task: about 20 µs at the shipped model's size.
 const TASK_ROWS: usize = 4;

@@ -3,8 +3,8 @@
 use anyhow::Result;
 use std::ops::Range;
 
-use crate::network::attention::{Group, Prefix, Tail};
 use crate::kernels::backend::Backend;
+use crate::network::attention::{Group, Prefix, Tail};
 use crate::network::rotary::HeadShape;
 
 /// Keys and values of each session's image and prompt; read-only, shared by its candidates.

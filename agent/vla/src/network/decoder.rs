@@ -8,16 +8,16 @@ use std::ops::Range;
 use anyhow::{Result, ensure};
 use candle_core::{Device, Tensor};
 
-use crate::kernels::activation::gated_silu;
-use crate::network::attention::{Group, Prefix};
-use crate::kernels::backend::Backend;
-use crate::network::cache::{PrefixCache, TailCache};
 use crate::checkpoint::config::TextConfig;
-use crate::network::linear::Linear;
+use crate::checkpoint::weights::Part;
+use crate::kernels::activation::gated_silu;
+use crate::kernels::backend::Backend;
 use crate::kernels::norm::RmsNorm;
+use crate::network::attention::{Group, Prefix};
+use crate::network::cache::{PrefixCache, TailCache};
+use crate::network::linear::Linear;
 use crate::network::rotary::{HeadShape, Rotary};
 use crate::network::trace::Trace;
-use crate::checkpoint::weights::Part;
 
 /// Token ids to hidden states to logits.
 pub struct Decoder {

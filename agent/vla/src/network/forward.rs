@@ -8,14 +8,14 @@ use candle_core::{Device, Tensor};
 use protocol::message::Image;
 use rayon::prelude::*;
 
+use crate::checkpoint::config::Config;
+use crate::checkpoint::weights::{Weights, weight_files};
 use crate::kernels::backend::Backend;
 use crate::network::cache::PrefixCache;
-use crate::checkpoint::config::Config;
 use crate::network::decoder::{Decoder, Wanted};
 use crate::network::projector::Projector;
 use crate::network::trace::Trace;
 use crate::network::vision::VisionBackbone;
-use crate::checkpoint::weights::{Weights, weight_files};
 
 /// Sessions per task of a prefill: few enough that a layer's rows stay in the caches.
 const TASK_SESSIONS: usize = 2;

@@ -3,11 +3,11 @@
 use anyhow::Result;
 use candle_core::Tensor;
 
+use crate::checkpoint::weights::Part;
 use crate::kernels::activation::gelu;
 use crate::kernels::backend::Backend;
 use crate::network::linear::Linear;
 use crate::network::trace::Trace;
-use crate::checkpoint::weights::Part;
 
 /// Linear layers with GELU between them.
 pub struct Projector {

@@ -8,16 +8,16 @@ use std::ops::Range;
 use anyhow::Result;
 use candle_core::{Device, Tensor};
 
-use crate::kernels::activation::gelu;
-use crate::network::attention::{Group, Prefix};
-use crate::kernels::backend::Backend;
 use crate::checkpoint::config::TowerConfig;
-use crate::network::linear::Linear;
+use crate::checkpoint::weights::Part;
+use crate::kernels::activation::gelu;
+use crate::kernels::backend::Backend;
 use crate::kernels::norm::LayerNorm;
+use crate::network::attention::{Group, Prefix};
+use crate::network::linear::Linear;
 use crate::network::pixels::{DINO, Normalisation, SIGLIP, patch_rows};
 use crate::network::rotary::HeadShape;
 use crate::network::trace::Trace;
-use crate::checkpoint::weights::Part;
 use protocol::message::Image;
 
 /// timm's value for both towers of OpenVLA; PyTorch's own default would be 1e-5.

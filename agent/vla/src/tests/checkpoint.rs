@@ -4,8 +4,8 @@ use std::collections::HashMap;
 
 use anyhow::Result;
 
-use crate::checkpoint::config::Config;
 use super::*;
+use crate::checkpoint::config::Config;
 
 /// Copies a tiny checkpoint into a fresh folder, after a change of its weights and its config.
 fn load_changed(

@@ -2,10 +2,10 @@
 
 use anyhow::Result;
 
+use super::*;
 use crate::network::decoder::Wanted;
 use crate::network::forward::Context;
 use crate::network::trace::Trace;
-use super::*;
 
 /// Largest difference from PyTorch's float32 results in any number of any layer.
 const TOLERANCE: f32 = 1e-4;

@@ -3,8 +3,8 @@
 use anyhow::Result;
 use candle_core::D;
 
-use decision::{Candidate, Proposal, ProposalRequest, TAGS};
 use super::*;
+use decision::{Candidate, Proposal, ProposalRequest, TAGS};
 
 /// Parts of the confidence: the tags and seven numbers of an action.
 const PARTS: usize = TAGS.len() + 7;
@@ -112,7 +112,8 @@ fn first_tokens_are_distributed_as_the_softmax_says() -> Result<()> {
     let image = image(4, policy.info().image_size.0);
     let outputs = policy.activations(&image, &policy.parser.prompter.ids(INSTRUCTION)?)?;
     let logits = &outputs[outputs.len() - 1].1;
-    let last = logits.narrow(0, logits.dim(0)? - 1, 1)?.narrow(1, 0, policy.parser.config.vocabulary)?;
+    let last =
+        logits.narrow(0, logits.dim(0)? - 1, 1)?.narrow(1, 0, policy.parser.config.vocabulary)?;
     let draws = 4000;
     for temperature in [0.5f32, 1.0] {
         let scaled = (&last / f64::from(temperature))?;
@@ -213,7 +214,8 @@ fn section(text: &str) -> usize {
 #[test]
 fn requests_that_cannot_be_answered_are_refused_in_words() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
-    let check = |request: ProposalRequest<'_>, expected: &str| match policy.propose_now(&[request]) {
+    let check = |request: ProposalRequest<'_>, expected: &str| match policy.propose_now(&[request])
+    {
         Err(error) => assert_eq!(error.to_string(), expected),
         Ok(_) => panic!("expected a refusal: {expected}"),
     };

@@ -357,7 +357,6 @@ fn what_a_killed_process_left_unfinished_is_nothing() {
         server: "s".into(),
         scope: FaultScope::Server,
         reason: "lost".into(),
-        never_acted: false,
     };
     run.fault(&fault).expect("noted");
     let path = run.folder.clone();
