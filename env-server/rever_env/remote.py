@@ -45,11 +45,13 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
         image_height, image_width: pixels, 1 to 1024; 0 and 0 for no image.
         fleet: namespace of the servers. server: id of one of them; by default the least used.
         expert: info has "expert_action", float32, what the server's scripted expert would do.
-        wait_secs: for a server with a free session (default: 2 s for a server to be found, 30 s for
-        a session to be free). reply_secs: for a reply, while the server is paused, too.
+        wait_secs: for a server with a free session (default: 30 s for a session to be free, but
+        2 to 5 s for a server to be there). reply_secs: for a reply, also while the server is
+        paused.
 
     Observation: image uint8 (height, width, 3), state float32 (n,), instruction text. Without
-    images (0 x 0 pixels, or a server that has none) or numbers that part is left out.
+    images (0 x 0 pixels, or a server that has none) or numbers that part is left out, and
+    without images render_mode is None.
     Action: float32 (n,), or a whole number where the task has a choice of actions. What the numbers
     are, session.task.state and session.task.action say; of a Bridge task see BridgeEnv.
     Reward, end of episodes and info: as the served environment has them. metadata["render_fps"] is

@@ -17,7 +17,8 @@ from rever_env.serving import Endpoints
 from rever_env.tasks import TaskId
 
 _LOOK_SECS = 0.2  # between looks for a server
-_NOBODY_SECS = 2.0  # how long there may be no server at all
+_REFUSED_SECS = 2.0  # how long connections may be refused
+_NOBODY_SECS = 5.0  # how long no server may be found over a connection
 _WAIT_SECS = 30.0  # for a server that is there to be free, or to answer
 _REACH_SECS = 5.0  # for one connection
 _RETURN_SECS = 2.0  # from a new connection to the server's token
@@ -44,8 +45,8 @@ class Fleet:
     """Which servers. connect: endpoints of servers or of a router, as tcp/HOST:PORT or HOST:PORT.
 
     server: its id; without one, the server with most free sessions.
-    wait_secs: for a free session. None: 30 s, but 2 s where no server is found and none at all
-    after the first session, where connections are refused.
+    wait_secs: for a free session. None: 30 s, but 5 s where no server is found, 2 s where
+    connections are refused, and none at all where they are refused to a second session.
     reply_secs: for a reply, including the time that a server is paused.
     """
 
@@ -100,7 +101,7 @@ class Network:
         if fleet.wait_secs is not None:
             reach_wait = wait = fleet.wait_secs
         else:
-            reach_wait, wait = (0.0, _REACH_SECS) if is_return else (_NOBODY_SECS, _WAIT_SECS)
+            reach_wait, wait = (0.0, _REACH_SECS) if is_return else (_REFUSED_SECS, _WAIT_SECS)
         self._reach(reach_wait)
         configuration = Endpoints(self._fleet.connect, (), multicast=False, wait_secs=wait)
         _first_process.append(self._process)

@@ -59,6 +59,7 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **arguments: Any,
     ) -> None:
+        self.envs: list[RemoteEnv] = []
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         endpoints = [connect] if isinstance(connect, str) else list(connect)
         lists = [
@@ -70,7 +71,6 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
             raise ValueError(
                 f"expected endpoints and environments, got {len(endpoints)} and {self.num_envs}"
             )
-        self.envs: list[RemoteEnv] = []
         try:
             for index in range(self.num_envs):
                 self.envs.append(

@@ -29,7 +29,7 @@ def test_a_killed_server_is_named_and_found_again_by_reset() -> None:
     begun = time.monotonic()
     with pytest.raises(RemoteFault, match=f"server {server} at {endpoint} is gone"):
         remote.step(STILL)
-    assert time.monotonic() - begun < 5.0
+    assert time.monotonic() - begun < 10.0
     with pytest.raises(RemoteFault, match="the session is lost, and reset opens a new one"):
         remote.step(STILL)
     with pytest.raises(RemoteFault, match="connection refused; is `python -m rever_env serve"):
@@ -100,7 +100,7 @@ def test_a_server_that_does_not_answer_in_time_is_told_apart_from_one_that_is_go
         begun = time.monotonic()
         with pytest.raises(RemoteFault, match=rf"at {endpoint} did not answer for 2 s"):
             remote.step(STILL)
-        assert 2.0 <= time.monotonic() - begun < 4.0
+        assert 2.0 <= time.monotonic() - begun < 10.0
         os.kill(process.pid, signal.SIGCONT)
         remote.reset(seed=0)
         remote.step(STILL)

@@ -160,7 +160,7 @@ def test_an_endpoint_needs_no_protocol(endpoint: str) -> None:
     [
         ("tcp/{free}", r"cannot connect to .*: connection refused; is `python -m rever_env serve"),
         ("tcp/host.invalid:7447", "host host.invalid: "),
-        ("fleet", r'no environment server found at tcp/\S+ within 2 s \(fleet "other"\)'),
+        ("fleet", r'no environment server found at tcp/\S+ within 5 s \(fleet "other"\)'),
         ("server", 'no environment server with id "other" found at tcp/'),
     ],
 )
@@ -171,7 +171,7 @@ def test_who_is_not_there_is_told_within_seconds(endpoint: str, where: str, word
             rever_env.RemoteEnv(where.format(free=free_endpoint().removeprefix("tcp/")))
         else:
             rever_env.RemoteEnv(endpoint, **{where: "other"})  # type: ignore[arg-type]
-    assert time.monotonic() - begun < 10.0
+    assert time.monotonic() - begun < 15.0
     assert ".rs" not in str(fault.value)
 
 
