@@ -43,7 +43,7 @@ pub enum ReadError {
         found: String,
     },
     /// Not what was written.
-    #[error("{path}: damaged: {reason}")]
+    #[error("{path}: damaged: {reason}; rerun the command of its run to run the episode again")]
     Damaged {
         /// The file.
         path: PathBuf,
@@ -205,8 +205,8 @@ mod tests {
             assert!(matches!(error, ReadError::Damaged { .. }), "{length} bytes: {error}");
         }
         let error = decode(&[&bytes[..], &[0]].concat()).expect_err("one byte more");
-        let expected = "a.msgpack: damaged: expected one record and nothing else";
-        assert_eq!(error.to_string(), expected);
+        let expected = "a.msgpack: damaged: expected one record and nothing else; rerun the command";
+        assert!(error.to_string().starts_with(expected), "{error}");
     }
 
     #[test]
