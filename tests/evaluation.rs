@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use agent::record::EpisodeRecord;
 use serde_json::Value;
+use store::record::EpisodeRecord;
 
 use crate::harness::{python, rever, run, text, wait_for};
 

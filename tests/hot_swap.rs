@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use agent::policy::{DeviceName, Policy};
-use agent::record::EpisodeRecord;
-use agent::training::{LabelledEpisode, TrainingSet, train};
-use agent::verifier::{Options, Verifier};
-use agent::wire::{Network, NetworkOptions, VerifierPublisher};
+use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
+use store::record::EpisodeRecord;
+use verifier::training::{LayoutKey, TrainingEpisode, TrainingSet, train};
+use verifier::{TrainingOptions, Verifier};
+use vla::CompletionParser;
 
 use crate::evaluation::{Evaluation, WAIT};
 use crate::harness::{repository, wait_for};
@@ -15,12 +15,13 @@ use crate::server::free_endpoint;
 const EPISODES: usize = 6;
 /// Of the policy that comes with the program.
 const HIDDEN_SIZE: usize = 256;
+const ACTION_LENGTH: usize = 7;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_published_verifier_is_taken_up_between_episodes() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = repository().join("agent/models/bridge-small");
-    let policy = Policy::load(&model, DeviceName::Cpu).expect("a policy");
+    let policy = CompletionParser::load(&model).expect("a policy");
     let (first, second) = (verifier(policy.digest(), 1), verifier(policy.digest(), 2));
     let path = folder.path().join("first.safetensors");
     std::fs::write(&path, first.bytes()).expect("the first verifier is written");
@@ -51,13 +52,13 @@ async fn a_published_verifier_is_taken_up_between_episodes() {
 async fn a_verifier_of_another_policy_is_not_taken_for_the_first() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = repository().join("agent/models/bridge-small");
-    let policy = Policy::load(&model, DeviceName::Cpu).expect("a policy");
+    let policy = CompletionParser::load(&model).expect("a policy");
     let (foreign, fitting) = (verifier(&"0".repeat(64), 1), verifier(policy.digest(), 2));
     let endpoint = free_endpoint();
     let evaluation = evaluation(folder.path(), &endpoint, &[]);
     let running = evaluation.start();
     let has_said = |words: &str| evaluation.words().contains(words).then_some(());
-    wait_for("the agent", WAIT, || has_said("verifiers are awaited"));
+    wait_for("the agent", WAIT, || has_said("waiting for versions of verifier live"));
     let options = NetworkOptions { connect: vec![endpoint], ..NetworkOptions::default() };
     let network = Network::open(options).await.expect("the agent is reached");
     let publisher = VerifierPublisher::declare(&network, "live").await.expect("a publisher");
@@ -92,18 +93,24 @@ fn verifier(policy: &str, seed: u64) -> Verifier {
     let size = HIDDEN_SIZE;
     let episodes = (0..20).map(|number| {
         let value = |index: usize| ((index * 7919 + number * 104_729) % 1000) as f32 / 1000.0;
-        LabelledEpisode {
+        TrainingEpisode {
             name: format!("episode {number}"),
+            layout: LayoutKey {
+                task: "widowx_spoon_on_towel".to_owned(),
+                variant: "default".to_owned(),
+                layout: None,
+                seed: number as u64,
+            },
             instruction: String::new(),
-            task: "widowx_spoon_on_towel".to_owned(),
             is_success: number % 2 == 0,
             hidden: (0..size).map(value).collect(),
             steps: vec![0],
             steps_total: 1,
+            steps_max: 60,
             decisions: None,
         }
     });
-    let set = TrainingSet::new(size, episodes).expect("a training set");
-    let options = Options { seed, epochs_max: 1, ..Options::default() };
+    let set = TrainingSet::new(size, ACTION_LENGTH, episodes).expect("a training set");
+    let options = TrainingOptions { seed, epochs_max: 1, ..TrainingOptions::default() };
     train(&set, policy, &options, |_| ()).expect("it can be trained")
 }

@@ -5,10 +5,8 @@ use std::path::Path;
 use std::process::Stdio;
 use std::sync::OnceLock;
 
-use agent::labels::LabelStore;
-use agent::record::EpisodeRecord;
-use agent::suite::TASKS;
 use serde_json::Value;
+use store::record::EpisodeRecord;
 
 use crate::evaluation::{Evaluation, WAIT, is_alive, kill};
 use crate::harness::{python, rever, run, succeed, text, wait_for};
@@ -24,7 +22,11 @@ const ARGUMENTS: [&str; 6] = [
     "--seed=7",
     "--sessions=8",
 ];
-const EPISODES: usize = TASKS.len() * 2;
+/// SIMPLER's WidowX tasks, which our servers offer.
+const TASKS: usize = 4;
+const EPISODES: usize = TASKS * 2;
+/// The same of these episodes as computed by the program before the decider had a crate of its own (commit 091f8b1).
+const DIGEST: &str = "4e7a574af4e1588ace47dbf25ef943f96de6ab3ab99f82b140cbd02ed5681cad";
 
 /// A run that nothing disturbed, made once for all tests that compare with it.
 fn undisturbed() -> &'static (Evaluation, Value) {
@@ -55,15 +57,24 @@ fn every_episode_leaves_a_record_and_a_label() {
         assert_eq!(record.steps.len(), steps_max(&record.identity.task), "{id}");
         let candidates = if record.identity.strategy == "sample" { 1 } else { 3 };
         for step in &record.steps {
-            assert_eq!(step.candidates.len(), candidates, "{id}");
-            let scored = step.candidates.iter().filter(|candidate| candidate.score.is_some());
-            let expected = step.candidates.iter().filter(|candidate| candidate.action.is_some());
+            let decision = step.decision.as_ref().expect("a decision in every step");
+            let all = &decision.candidates;
+            assert_eq!(all.len(), candidates, "{id}");
+            let scored = all.iter().filter(|candidate| candidate.score.is_some());
+            let expected = all.iter().filter(|candidate| candidate.actions.is_some());
             if candidates > 1 {
                 assert_eq!(scored.count(), expected.count(), "{id}: the well-formed are scored");
             }
         }
     }
     assert_eq!(labelled(evaluation), records.keys().cloned().collect());
+}
+
+#[test]
+fn what_episodes_do_never_changes() {
+    let (evaluation, _) = undisturbed();
+    let said = succeed(rever().arg("digest").arg(evaluation.run_folder()));
+    assert_eq!(said, format!("{DIGEST} {EPISODES} episodes\n"));
 }
 
 #[test]
@@ -90,7 +101,7 @@ fn the_result_file_has_the_documented_shape() {
     assert!(0.0 < p50("simulator_ms") && p50("simulator_ms") < p50("step_ms"), "{result}");
     let rows = result["rows"].as_array().expect("rows");
     // One per task and one for all, for each strategy.
-    assert_eq!(rows.len(), (TASKS.len() + 1) * 2);
+    assert_eq!(rows.len(), (TASKS + 1) * 2);
     for row in rows {
         for key in ["task", "variant", "strategy"] {
             assert!(row[key].is_string(), "{key} in {row}");
@@ -108,7 +119,7 @@ fn the_result_file_has_the_documented_shape() {
     let paired = result["paired"].as_array().expect("paired");
     let gain = paired.iter().find(|pair| pair["a"] == "verifier" && pair["b"] == "sample");
     let gain = gain.expect("the verifier is compared with a single sample");
-    assert_eq!(gain["episodes"], TASKS.len());
+    assert_eq!(gain["episodes"], TASKS);
     assert!(["gain", "low", "high"].iter().all(|key| gain[*key].is_f64()), "{gain}");
 }
 
@@ -146,7 +157,7 @@ fn episodes_of_a_killed_server_are_run_again_and_leave_one_label() {
     kill(server);
     assert!(running.succeeds(), "{}", evaluation.words());
 
-    let faults = agent::run::faults(&evaluation.run_folder()).expect("a list of faults");
+    let faults = store::run::faults(&evaluation.run_folder()).expect("a list of faults");
     assert!(!faults.is_empty(), "no episode broke: {}", evaluation.words());
     let result = evaluation.finish();
     let averages = result["rows"].as_array().expect("rows").iter();
@@ -248,7 +259,7 @@ fn a_reset_that_breaks_is_repeated_and_another_simulator_is_left_out() {
     let evaluation = Evaluation::new(&fresh_folder("mixed"), &arguments);
     assert!(evaluation.start().succeeds(), "{}", evaluation.words());
     assert_eq!(evaluation.records().len(), 2);
-    let faults = agent::run::faults(&evaluation.run_folder()).expect("a list");
+    let faults = store::run::faults(&evaluation.run_folder()).expect("a list");
     assert_eq!(faults.len(), 1, "{faults:?}");
     assert!(faults[0].reason.contains("made up"), "{faults:?}");
     let said = evaluation.words();
@@ -278,7 +289,10 @@ fn assert_same_episodes(ours: &Evaluation, theirs: &Evaluation) {
         let steps = |record: &EpisodeRecord| {
             let mut steps = record.steps.clone();
             for step in &mut steps {
-                (step.decision_ms, step.step_ms, step.simulator_ms) = (0.0, 0.0, None);
+                (step.step_ms, step.simulator_ms) = (0.0, 0.0);
+                if let Some(decision) = &mut step.decision {
+                    (decision.batch_ms, decision.batch_size) = (0.0, 1);
+                }
             }
             steps
         };
@@ -289,8 +303,7 @@ fn assert_same_episodes(ours: &Evaluation, theirs: &Evaluation) {
 
 /// The ids of all labels, each of which is there once.
 fn labelled(evaluation: &Evaluation) -> BTreeSet<String> {
-    let store = LabelStore::open(&evaluation.labels()).expect("a label store");
-    let labels = store.labels().expect("its labels");
+    let labels = store::labels::labels(&evaluation.labels()).expect("its labels");
     let ids: BTreeSet<String> = labels.iter().map(|label| label.id.clone()).collect();
     assert_eq!(ids.len(), labels.len(), "a label is there twice");
     ids

@@ -1,16 +1,16 @@
 //! The real client against real servers over zenoh, on good wires and bad ones.
 
-use std::collections::BTreeSet;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use agent::wire::{
-    Environment, EnvironmentFault, Network, NetworkOptions, OutcomePublisher, OutcomeSubscriber,
-    Timing, VerifierPublisher, VerifierSubscriber,
-};
 use protocol::{
     EpisodeOutcome, Observation, Open, Opening, PROTOCOL_VERSION, Reply, Reset, Statistics,
     Transition, decode,
+};
+use runtime::fault::EnvironmentFault;
+use runtime::wire::{
+    Environment, Network, NetworkOptions, OutcomePublisher, Timing, VerifierPublisher,
+    VerifierSubscriber,
 };
 
 use crate::harness::repository;
@@ -49,7 +49,7 @@ async fn listen(fleet: &str) -> Network {
 async fn network_with_server(fleet: &str, arguments: &[&str]) -> (Network, Server) {
     let network = listen(fleet).await;
     let server = Server::start(&network.listening()[0], fleet, arguments);
-    assert_eq!(network.servers(1, WAIT).await.len(), 1, "the server describes itself");
+    assert_eq!(network.servers(1, WAIT).await.servers.len(), 1, "the server describes itself");
     (network, server)
 }
 
@@ -65,7 +65,7 @@ async fn connect_through(endpoint: &str, timing: Timing) -> Network {
     let (connect, fleet) = (vec![endpoint.to_owned()], "agents".to_owned());
     let options = NetworkOptions { connect, fleet, timing, ..NetworkOptions::default() };
     let network = Network::open(options).await.expect("the network opens");
-    assert_eq!(network.servers(1, WAIT).await.len(), 1, "the server is seen through the relay");
+    assert_eq!(network.servers(1, WAIT).await.servers.len(), 1, "the server is seen through the relay");
     network
 }
 
@@ -95,13 +95,14 @@ async fn trajectory(network: &Network, server: &str) -> Result<Trajectory, Envir
         if step == 6 {
             episode.save(2).await?;
         }
-        let action = episode.expert_action().expect("the expert was asked for");
-        transitions.push(episode.step(action).await?);
+        let action = episode.observation().expert_action.clone();
+        let action = action.expect("the expert was asked for");
+        transitions.push(episode.step(&action).await?);
     }
     episode.restore(2).await?;
     observations.push(episode.observation().clone());
     for _ in 0..3 {
-        transitions.push(episode.step([0.01, 0.0, -0.005, 0.0, 0.0, 0.1, 1.0]).await?);
+        transitions.push(episode.step(&[0.01, 0.0, -0.005, 0.0, 0.0, 0.1, 1.0]).await?);
     }
     let episode = episode.finish().reset(reset("widowx_stack_cube", None)).await?;
     observations.push(episode.observation().clone());
@@ -149,11 +150,11 @@ async fn a_killed_server_is_a_fault_within_seconds_and_another_one_gives_the_sam
     let whole = trajectory(&network, &first.id).await.expect("the first server lives");
     let environment = Environment::open(&network, &first.id, open()).await.expect("a session");
     let mut episode = environment.reset(spoon()).await.expect("an episode");
-    episode.step([0.0; 7]).await.expect("the first server lives");
+    episode.step(&[0.0; 7]).await.expect("the first server lives");
     first.kill();
     let killed_at = Instant::now();
     let fault = loop {
-        match episode.step([0.0; 7]).await {
+        match episode.step(&[0.0; 7]).await {
             Ok(_) => assert!(killed_at.elapsed() < WAIT, "a dead server answers"),
             Err(fault) => break fault,
         }
@@ -164,8 +165,7 @@ async fn a_killed_server_is_a_fault_within_seconds_and_another_one_gives_the_sam
         "the fault took {:?}",
         killed_at.elapsed()
     );
-    let left: Vec<_> =
-        network.servers(1, WAIT).await.into_iter().map(|server| server.server).collect();
+    let left: Vec<_> = network.servers(1, WAIT).await.servers.into_keys().collect();
     assert_eq!(left, std::slice::from_ref(&second.id));
     let again = trajectory(&network, &second.id).await.expect("the second server lives");
     assert!(again == whole, "another server gave other steps");
@@ -182,7 +182,7 @@ async fn a_stuck_simulation_times_out_though_its_token_stands() {
     let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
     let mut episode = environment.reset(spoon()).await.expect("an episode");
     relay.get_stuck();
-    let fault = episode.step([0.0; 7]).await.expect_err("nothing passes");
+    let fault = episode.step(&[0.0; 7]).await.expect_err("nothing passes");
     let EnvironmentFault::TimedOut { asked: "Step", waited_secs: 3..=10, .. } = fault else {
         panic!("expected to time out after 3 s, got {fault:?}")
     };
@@ -193,28 +193,28 @@ async fn a_stuck_simulation_times_out_though_its_token_stands() {
 async fn a_session_dies_with_its_holder() {
     let (network, server) = network_with_server("holder", &["--sessions", "1"]).await;
     let holder = connect(&server, "holder").await;
-    assert_eq!(holder.servers(1, WAIT).await.len(), 1, "the server describes itself");
+    assert_eq!(holder.servers(1, WAIT).await.servers.len(), 1, "the server describes itself");
     let environment = Environment::open(&holder, &server.id, open()).await.expect("a session");
     let fault =
         Environment::open(&network, &server.id, open()).await.expect_err("one session at once");
     assert_eq!(fault, EnvironmentFault::Refused { reason: "all 1 sessions are in use".into() });
     let mut episode = environment.reset(spoon()).await.expect("an episode");
-    episode.step([0.0; 7]).await.expect("a step");
+    episode.step(&[0.0; 7]).await.expect("a step");
     drop(episode);
-    assert_eq!(sessions_become(&network, 0).await, 0, "a dropped session lives on");
+    assert_eq!(sessions_become(&network, &server.id, 0).await, 0, "a dropped session lives on");
     let environment = Environment::open(&holder, &server.id, open()).await.expect("it is free");
     let _episode = environment.reset(spoon()).await.expect("an episode");
-    assert_eq!(sessions_become(&network, 1).await, 1, "the session is not counted");
+    assert_eq!(sessions_become(&network, &server.id, 1).await, 1, "the session is not counted");
     holder.close().await.expect("the holder goes");
-    assert_eq!(sessions_become(&network, 0).await, 0, "the session lives on without its holder");
+    assert_eq!(sessions_become(&network, &server.id, 0).await, 0, "the session lives on without its holder");
     Environment::open(&network, &server.id, open()).await.expect("the session is free again");
 }
 
 /// Asks until the server has that many sessions in use; returns what it had last.
-async fn sessions_become(network: &Network, expected: u32) -> u32 {
+async fn sessions_become(network: &Network, server: &str, expected: u32) -> u32 {
     let deadline = Instant::now() + WAIT;
     loop {
-        let sessions = network.servers(1, WAIT).await[0].sessions;
+        let sessions = network.describe(server).await.expect("a description").sessions;
         if sessions == expected || Instant::now() > deadline {
             return sessions;
         }
@@ -237,16 +237,16 @@ async fn wrong_requests_are_refused_in_words_and_leave_the_world_as_it_was() {
     let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
     let mut episode = environment.reset(spoon()).await.expect("an episode");
     check(
-        episode.step([f32::NAN; 7]).await.map(drop),
+        episode.step(&[f32::NAN; 7]).await.map(drop),
         "action: expected finite numbers, got nan at index 0",
     );
     check(episode.restore(3).await, "slot: expected one of [], got 3");
     check(episode.save(16).await, "slot: expected 0 to 15, got 16");
-    let first = episode.step([0.0; 7]).await.expect("the episode goes on");
+    let first = episode.step(&[0.0; 7]).await.expect("the episode goes on");
     let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
     let mut undisturbed = environment.reset(spoon()).await.expect("an episode");
     assert!(
-        undisturbed.step([0.0; 7]).await.expect("a step") == first,
+        undisturbed.step(&[0.0; 7]).await.expect("a step") == first,
         "a refused request changed the world"
     );
 }
@@ -308,30 +308,35 @@ async fn what_no_client_of_ours_would_send_is_refused_in_words() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn outcomes_reach_those_who_come_early_and_those_who_come_late() {
+async fn an_outcome_reaches_an_observer_and_waits_for_none() {
     let source = listen("outcomes").await;
-    let connect = source.listening().to_vec();
-    let options = NetworkOptions { connect, fleet: "outcomes".into(), ..NetworkOptions::default() };
-    let reader = Network::open(options).await.expect("the network opens");
-    let mut early = OutcomeSubscriber::declare(&reader, None).await.expect("a subscriber");
     let publisher = OutcomePublisher::declare(&source, "run-1").await.expect("a publisher");
-    for episode in 0..200 {
-        publisher.publish(&outcome("run-1", episode)).await.expect("published");
+    publisher.publish(&outcome("run-1", 0)).expect("without any observer");
+    let endpoints = format!("[\"{}\"]", source.listening()[0]);
+    let mut configuration = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", "\"client\""),
+        ("connect/endpoints", &endpoints),
+        ("scouting/multicast/enabled", "false"),
+    ] {
+        configuration.insert_json5(key, value).expect("zenoh has this option");
     }
-    publisher.publish(&outcome("run-2", 0)).await.expect_err("an outcome of another run");
-    let mut late = OutcomeSubscriber::declare(&reader, Some("run-1")).await.expect("a subscriber");
-    for subscriber in [&mut early, &mut late] {
-        // What is live may overtake what is cached: readers key outcomes by episode, not by order.
-        let mut missing: BTreeSet<u32> = (0..200).collect();
-        while !missing.is_empty() {
-            let next = tokio::time::timeout(WAIT, subscriber.next())
-                .await
-                .unwrap_or_else(|_| panic!("in time: still missing {missing:?}"))
-                .expect("an outcome");
-            assert_eq!(next, outcome("run-1", next.episode));
-            missing.remove(&next.episode);
+    let observer = zenoh::open(configuration).await.expect("the observer connects");
+    let outcomes =
+        observer.declare_subscriber("rever/3/outcomes/outcome/*").await.expect("a subscriber");
+    // The subscription travels to the publisher; until it is there, outcomes are nobody's.
+    let seen = async {
+        loop {
+            publisher.publish(&outcome("run-1", 7)).expect("published");
+            let wait = Duration::from_millis(100);
+            if let Ok(sample) = tokio::time::timeout(wait, outcomes.recv_async()).await {
+                break sample.expect("a sample");
+            }
         }
-    }
+    };
+    let sample = tokio::time::timeout(WAIT, seen).await.expect("in time");
+    let got: EpisodeOutcome = decode(&sample.payload().to_bytes()).expect("an outcome");
+    assert_eq!(got, outcome("run-1", 7));
 }
 
 fn outcome(run: &str, episode: u32) -> EpisodeOutcome {
