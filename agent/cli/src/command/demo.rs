@@ -9,6 +9,7 @@ use decision::{Setting, Strategy};
 use evaluation::result_file::ResultFile;
 use evaluation::suite::Layouts;
 use evaluation::table;
+use runtime::servers::Host;
 use store::plan::SeedRange;
 
 use super::episodes::{EpisodesArguments, Request};
@@ -42,7 +43,7 @@ pub struct Arguments {
 }
 
 /// Runs the demonstration, prints its tables and where its page is.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let started = Instant::now();
     println!(
         "{} random layouts of each task, each with a single sample and with the verifier's choice of {CANDIDATES}",
@@ -58,7 +59,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
         python: arguments.python,
         ..EpisodesArguments::default()
     };
-    let outcome = episodes.run(Request {
+    let outcome = episodes.run(host, Request {
         title: "demo",
         episodes: arguments.episodes,
         layouts: Layouts::Random,

@@ -28,6 +28,6 @@ pub use python::{
     PythonEnvironment, development_environment, named_environment, servers_environment,
     simulators_environment,
 };
-pub use source::{LocalSource, ServerSource};
+pub use source::{Deployment, LocalSource, ServerSource};
 
 pub use system_packages::GL_PACKAGES;

@@ -62,8 +62,9 @@ fn find(installation: &Installation) -> Result<PathBuf> {
     let beside = host.program.as_deref().and_then(Path::parent).map(Path::to_owned);
     let path = host.variables.get(OsStr::new("PATH")).cloned().unwrap_or_default();
     let built = installation.is_checkout().then(|| installation.root.join("target/release"));
-    let mut folders = beside.into_iter().chain(built).chain(std::env::split_paths(&path));
-    if let Some(program) = folders.map(|folder| folder.join(PROGRAM)).find(|file| file.is_file()) {
+    let folders = beside.into_iter().chain(built).chain(std::env::split_paths(&path));
+    let mut files = folders.map(|folder| folder.join(PROGRAM));
+    if let Some(program) = files.find(|file| file.is_file()) {
         return Ok(program);
     }
     if installation.is_checkout() {

@@ -115,7 +115,7 @@ fn pid(child: &Child) -> Option<Pid> {
 /// Returns when the process has ended, without removing it from the system's table, and its last words are read.
 fn wait_for_end(id: Pid, all_read: &Receiver<Infallible>) {
     let options = WaitIdOptions::EXITED | WaitIdOptions::NOWAIT;
-    while waitid(WaitId::Pid(id), options) == Err(Errno::INTR) {}
+    while waitid(WaitId::Pid(id), options).is_err_and(|error| error == Errno::INTR) {}
     // The channel closes when both pipes are read to their ends.
     let _ = all_read.recv_timeout(LAST_WORDS_WAIT);
 }

@@ -74,10 +74,15 @@ pub struct PythonEnvironment {
 }
 
 impl PythonEnvironment {
-    fn new(python: PathBuf, installation: &Installation) -> PythonEnvironment {
+    fn new(python: PathBuf, installation: &Installation, missing: Missing) -> PythonEnvironment {
         let package_root = installation.package_root();
         let mut variables = variables::for_server(&installation.host.variables);
         variables.insert("PYTHONPATH".into(), package_root.clone().into());
+        if missing == Missing::Report {
+            // Python and Mesa would otherwise keep what they compile.
+            variables.insert("PYTHONDONTWRITEBYTECODE".into(), "1".into());
+            variables.insert("MESA_SHADER_CACHE_DISABLE".into(), "true".into());
+        }
         PythonEnvironment { python, package_root, variables }
     }
 
@@ -144,8 +149,12 @@ pub fn development_environment(installation: &Installation) -> Result<PythonEnvi
 }
 
 /// A Python of the user's, which has the packages already. Such an interpreter may need the user's library path.
-pub fn named_environment(installation: &Installation, python: &Path) -> PythonEnvironment {
-    let mut environment = PythonEnvironment::new(python.to_owned(), installation);
+pub fn named_environment(
+    installation: &Installation,
+    python: &Path,
+    missing: Missing,
+) -> PythonEnvironment {
+    let mut environment = PythonEnvironment::new(python.to_owned(), installation, missing);
     let libraries = OsString::from("LD_LIBRARY_PATH");
     if let Some(path) = installation.host.variables.get(&libraries) {
         environment.variables.insert(libraries, path.clone());
@@ -163,11 +172,7 @@ fn environment_with(
         locks.iter().map(|lock| installation.package_root().join(lock)).collect();
     let digests: Vec<String> = files.iter().map(|file| digest_of(file)).collect::<Result<_>>()?;
     let folder = installation.environment_folder(name, digests.first().context("no packages")?);
-    let mut environment = PythonEnvironment::new(folder.join("bin/python"), installation);
-    if missing == Missing::Report {
-        // Python would otherwise write compiled modules beside the sources.
-        environment.variables.insert("PYTHONDONTWRITEBYTECODE".into(), "1".into());
-    }
+    let environment = PythonEnvironment::new(folder.join("bin/python"), installation, missing);
     for (lock, digest) in files.iter().zip(&digests) {
         let setup = Setup { installation, environment: &environment, folder: &folder, lock };
         match missing {

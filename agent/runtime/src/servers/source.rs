@@ -1,6 +1,7 @@
 //! Where a run's servers come from: processes that are started on this machine, or endpoints.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
@@ -45,20 +46,39 @@ pub struct LocalSource {
     pub installation: Installation,
 }
 
+/// An open network, and the servers that were started for it.
+pub struct Deployment {
+    /// What was asked for.
+    pub source: ServerSource,
+    /// The way to all servers.
+    pub network: Network,
+    /// Those of this machine.
+    pub local: Option<Arc<LocalServers>>,
+}
+
+impl Deployment {
+    /// Ends the local servers, then the network. Blocks.
+    pub fn close(self, runtime: &Runtime) -> Result<()> {
+        // Servers first: they would report the network's end as an error.
+        drop(self.local);
+        runtime.block_on(self.network.close())
+    }
+}
+
 impl ServerSource {
-    /// Opens the network and starts the local servers if there are any, each for up to `sessions` sessions. Blocks.
-    ///
-    /// End the servers before the network: they would report its end as an error.
-    pub fn open(
-        &self,
-        runtime: &Runtime,
-        sessions: usize,
-    ) -> Result<(Network, Option<LocalServers>)> {
-        // Before the network, for it may take minutes.
-        let program = self.local.as_ref().map(|local| local.program(Missing::Install)).transpose()?;
+    /// Opens the network and starts the local servers if there are any, each for up to `sessions` sessions. Blocks; what the
+    /// servers need is installed first, which may take minutes.
+    pub fn open(&self, runtime: &Runtime, sessions: usize) -> Result<Deployment> {
+        let local = self.local.as_ref();
+        let program = local.map(|local| local.program(Missing::Install)).transpose()?;
         let network = runtime.block_on(Network::open(self.network_options()))?;
         let local = program.map(|program| self.start(program, &network, sessions)).transpose()?;
-        Ok((network, local))
+        Ok(Deployment { source: self.clone(), network, local: local.map(Arc::new) })
+    }
+
+    /// How many servers are started here.
+    pub fn local_count(&self) -> usize {
+        self.local.as_ref().map_or(0, |local| local.count)
     }
 
     /// Local servers connect to this agent; to reach others nothing needs to listen here.
@@ -80,7 +100,7 @@ impl ServerSource {
         sessions: usize,
     ) -> Result<LocalServers> {
         let options = LocalServerOptions {
-            count: self.local.as_ref().map_or(0, |local| local.count),
+            count: self.local_count(),
             connect: network.listening().first().context("the network listens nowhere")?.clone(),
             fleet: self.fleet.clone(),
             // Each could serve all of them, should the others die.
@@ -106,7 +126,7 @@ impl LocalSource {
     /// The Python that the servers run on, or whose MuJoCo they use.
     pub fn python_environment(&self, missing: Missing) -> Result<PythonEnvironment> {
         match (&self.python, self.simulator) {
-            (Some(python), _) => Ok(named_environment(&self.installation, python)),
+            (Some(python), _) => Ok(named_environment(&self.installation, python, missing)),
             (None, Simulator::Robosuite) => simulators_environment(&self.installation, missing),
             (None, Simulator::Python | Simulator::Native) => {
                 servers_environment(&self.installation, missing)

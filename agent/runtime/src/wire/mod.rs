@@ -7,6 +7,7 @@
 mod discovery;
 mod environment;
 mod episode;
+mod local_endpoint;
 mod network;
 mod outcomes;
 mod pool;

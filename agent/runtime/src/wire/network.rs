@@ -1,7 +1,6 @@
 //! One zenoh session: what it connects to, where it listens, and the servers that it sees.
 
 use std::net::{Ipv4Addr, TcpListener};
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -11,11 +10,8 @@ use tempfile::TempDir;
 use zenoh::Session;
 
 use super::discovery::{Discovery, Fleet};
+use super::local_endpoint::{ANY_LOOPBACK_PORT, local_endpoint};
 
-/// Stands for a free port of this machine alone.
-const ANY_LOOPBACK_PORT: &str = "tcp/127.0.0.1:0";
-/// Of a socket in the file system; a system's own limit is 104 or 108 with the name that zenoh adds for a lock.
-const SOCKET_PATH_BYTES_MAX: usize = 96;
 /// Another process may take a port between its choice and its use.
 const PORT_ATTEMPTS_MAX: usize = 10;
 /// A client waits this long for the router or server that it is told to connect to.
@@ -100,7 +96,8 @@ impl Network {
     /// Opens the session. Needs a tokio runtime with several threads.
     pub async fn open(options: NetworkOptions) -> anyhow::Result<Self> {
         let keys = Keys::new(&options.fleet)?;
-        let here = options.listen_here.then(|| here(&tempfile::env::temp_dir())).transpose()?;
+        let here = options.listen_here.then(|| local_endpoint(&tempfile::env::temp_dir()));
+        let here = here.transpose()?;
         let (here, folder) = here.unzip();
         let listen: Vec<String> = here.into_iter().chain(options.listen.clone()).collect();
         let (session, listening) = open_session(&options, &listen).await?;
@@ -136,6 +133,11 @@ impl Network {
         fleet.borrow().clone()
     }
 
+    /// When a server's simulation last moved, if it was ever heard of.
+    pub fn last_beat(&self, server: &str) -> Option<std::time::Instant> {
+        self.discovery.status(server).borrow().beaten_at.map(tokio::time::Instant::into_std)
+    }
+
     /// Whether servers are reached over a link of their own, which may fail without them.
     pub(super) fn is_remote(&self) -> bool {
         self.is_remote
@@ -151,30 +153,6 @@ impl Network {
     pub async fn close(self) -> anyhow::Result<()> {
         self.session.close().await.map_err(|error| anyhow!("cannot close the network: {error}"))
     }
-}
-
-/// An endpoint of this machine alone, and the folder that it lies in.
-#[cfg(unix)]
-fn here(parent: &Path) -> anyhow::Result<(String, Option<TempDir>)> {
-    use std::fs::Permissions;
-    use std::os::unix::fs::PermissionsExt;
-
-    let mut folder = tempfile::Builder::new();
-    folder.prefix("rever-").permissions(Permissions::from_mode(0o700));
-    let folder = folder.tempdir_in(parent).context("no temporary folder for a socket")?;
-    let socket = folder.path().join("zenoh");
-    // What begins an endpoint's parameters cannot stand in its address.
-    let fits = |path: &&str| path.len() <= SOCKET_PATH_BYTES_MAX && !path.contains(['?', '#', ';']);
-    Ok(match socket.to_str().filter(fits) {
-        Some(path) => (format!("unixsock-stream/{path}"), Some(folder)),
-        None => (ANY_LOOPBACK_PORT.to_owned(), None),
-    })
-}
-
-/// An endpoint of this machine alone.
-#[cfg(not(unix))]
-fn here(_parent: &Path) -> anyhow::Result<(String, Option<TempDir>)> {
-    Ok((ANY_LOOPBACK_PORT.to_owned(), None))
 }
 
 async fn open_session(
@@ -216,35 +194,4 @@ fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Resu
             .map_err(|error| anyhow!("zenoh does not take {key} = {value}: {error}"))?;
     }
     Ok(configuration)
-}
-
-#[cfg(all(test, unix))]
-mod tests {
-    use std::os::unix::fs::PermissionsExt;
-
-    use super::*;
-
-    #[tokio::test(flavor = "multi_thread")]
-    async fn the_socket_is_this_users_alone_and_goes_with_the_network() -> anyhow::Result<()> {
-        let network = Network::open(NetworkOptions::default()).await?;
-        let endpoint = network.listening()[0].clone();
-        let socket = Path::new(endpoint.strip_prefix("unixsock-stream/").context("no socket")?);
-        let folder = socket.parent().context("no folder")?;
-        assert!(socket.exists());
-        assert_eq!(folder.metadata()?.permissions().mode() & 0o777, 0o700);
-        network.close().await?;
-        assert!(!folder.exists());
-        Ok(())
-    }
-
-    #[test]
-    fn a_folder_with_too_long_a_name_for_a_socket_gives_a_port() -> anyhow::Result<()> {
-        let folder = tempfile::tempdir()?;
-        let deep = folder.path().join("d".repeat(SOCKET_PATH_BYTES_MAX));
-        std::fs::create_dir(&deep)?;
-        assert_eq!(here(&deep)?.0, ANY_LOOPBACK_PORT);
-        assert!(here(folder.path())?.0.starts_with("unixsock-stream/"));
-        assert_eq!(deep.read_dir()?.count(), 0);
-        Ok(())
-    }
 }
