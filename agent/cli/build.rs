@@ -67,10 +67,7 @@ fn pack() -> Result<String, Box<dyn Error>> {
     Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
-fn append(
-    archive: &mut Builder<GzEncoder<File>>,
-    place: &Path,
-) -> Result<(), Box<dyn Error>> {
+fn append(archive: &mut Builder<GzEncoder<File>>, place: &Path) -> Result<(), Box<dyn Error>> {
     let path = Path::new(ROOT).join(place);
     if path.is_dir() {
         let entries: Result<Vec<_>, _> = path.read_dir()?.collect();

@@ -31,6 +31,9 @@ pub fn policy_folder(named: Option<&PathBuf>, host: &Host) -> Result<PathBuf> {
 /// A file that only a checkout has.
 pub fn of_checkout(host: &Host, path: &str) -> Result<PathBuf> {
     let installation = installation(host)?;
-    ensure!(installation.is_checkout(), "{path}: expected to run in a checkout of rever, which has it");
+    ensure!(
+        installation.is_checkout(),
+        "{path}: expected to run in a checkout of rever, which has it"
+    );
     Ok(installation.root.join(path))
 }

@@ -41,7 +41,10 @@ mod tests {
     #[test]
     fn no_folder_of_the_machine_that_built_the_program_is_named() {
         let check = |file, expected| assert_eq!(name_of(file), expected);
-        check("/home/a b/.cargo/registry/src/index.crates.io-1/zenoh-1.10/src/x.rs", "zenoh-1.10/src/x.rs");
+        check(
+            "/home/a b/.cargo/registry/src/index.crates.io-1/zenoh-1.10/src/x.rs",
+            "zenoh-1.10/src/x.rs",
+        );
         check("/home/a b/rever/agent/cli/src/main.rs", "main.rs");
         check("agent/cli/src/main.rs", "agent/cli/src/main.rs");
     }

@@ -16,8 +16,8 @@ use tokio::runtime::Runtime;
 use tokio::sync::watch;
 
 use crate::rollout::{RecordOptions, Rollout};
-use crate::sinks::{EventSink, OutcomeSink, Progress, Sinks, StoreSink, VideoSink};
 use crate::servers::Deployment;
+use crate::sinks::{EventSink, OutcomeSink, Progress, Sinks, StoreSink, VideoSink};
 use crate::stop::{self, Stop};
 use crate::wire::{Fleet, OutcomePublisher, PoolOptions, VerifierSubscriber, ZenohPool};
 
@@ -143,8 +143,7 @@ impl Experiment {
         let successes = summaries.iter().filter(|one| one.statistics.is_success).count();
         let waiting = queue.progress().await?.waiting;
         let done = summaries.len() as u64;
-        let progress =
-            Progress::new(&self.title, done + waiting as u64, done, successes as u64);
+        let progress = Progress::new(&self.title, done + waiting as u64, done, successes as u64);
         let outcomes = OutcomePublisher::declare(network, &name).await?;
         let mut sinks: Vec<Box<dyn EventSink>> = Vec::new();
         if self.record.video {

@@ -9,8 +9,8 @@ use decision::{Decider, Policy, Scorer, Setting, Strategy, TaskId};
 use evaluation::suite::{Layouts, Suite};
 use runtime::experiment::{default_tasks, pool_options};
 use runtime::rollout::{RecordOptions, Rollout};
-use runtime::sinks::{Counts, OutcomeSink, Progress, Sinks, StoreSink};
 use runtime::servers::{Deployment, ServerSource};
+use runtime::sinks::{Counts, OutcomeSink, Progress, Sinks, StoreSink};
 use runtime::stop::Stop;
 use runtime::wire::{OutcomePublisher, ZenohPool};
 use serde::Serialize;
@@ -105,8 +105,7 @@ impl ThroughputBench<'_> {
         let counts = progress.counts();
         let (_never, stop) = watch::channel(Stop::No);
         let outcomes = OutcomePublisher::declare(&deployment.network, &name).await?;
-        let (_newer, scorer) =
-            watch::channel(Some(Arc::clone(&self.verifier) as Arc<dyn Scorer>));
+        let (_newer, scorer) = watch::channel(Some(Arc::clone(&self.verifier) as Arc<dyn Scorer>));
         let policy = Arc::clone(&self.policy) as Arc<dyn Policy>;
         let pool = pool_options(policy.info(), name, None);
         let rollout = Rollout {

@@ -120,7 +120,8 @@ impl WireBench<'_> {
         let mut episodes = reset(environments, tasks).await?;
         for index in 0..WARM_UP_STEPS + self.steps {
             if index % EPISODE_STEPS == EPISODE_STEPS - 1 {
-                episodes = reset(episodes.into_iter().map(Episode::finish).collect(), tasks).await?;
+                episodes =
+                    reset(episodes.into_iter().map(Episode::finish).collect(), tasks).await?;
             }
             let (step_ms, after) = at_once(episodes, |mut episode: Episode| async move {
                 episode.step(&circling(index)).await.map(|_| episode)

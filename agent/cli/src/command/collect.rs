@@ -44,13 +44,16 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     };
     let mut episodes_arguments = arguments.episodes_arguments;
     episodes_arguments.all_hidden |= strategy == Strategy::Sample;
-    let outcome = episodes_arguments.run(host, Request {
-        title: "collect",
-        episodes: arguments.episodes,
-        layouts: Layouts::Random,
-        range: SeedRange::Collection,
-        settings: vec![setting],
-    })?;
+    let outcome = episodes_arguments.run(
+        host,
+        Request {
+            title: "collect",
+            episodes: arguments.episodes,
+            layouts: Layouts::Random,
+            range: SeedRange::Collection,
+            settings: vec![setting],
+        },
+    )?;
     println!("labels: {}", episodes_arguments.labels.display());
     show(&outcome, arguments.json.as_deref())
 }

@@ -59,13 +59,16 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         python: arguments.python,
         ..EpisodesArguments::default()
     };
-    let outcome = episodes.run(host, Request {
-        title: "demo",
-        episodes: arguments.episodes,
-        layouts: Layouts::Random,
-        range: SeedRange::Evaluation,
-        settings: vec![setting(Strategy::Sample), setting(Strategy::Verifier)],
-    })?;
+    let outcome = episodes.run(
+        host,
+        Request {
+            title: "demo",
+            episodes: arguments.episodes,
+            layouts: Layouts::Random,
+            range: SeedRange::Evaluation,
+            settings: vec![setting(Strategy::Sample), setting(Strategy::Verifier)],
+        },
+    )?;
     let out = outcome.folder.join("report");
     let page = report::build(&outcome.folder, &out, &outcome.policy, report::EPISODES_MAX)?;
     println!("\n{}", table::text(&outcome.results));

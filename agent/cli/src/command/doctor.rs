@@ -98,7 +98,8 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     }
     if program.is_some() || source.local.is_none() {
         let size = policy.as_ref().map_or(IMAGE_SIZE_DEFAULT, |policy| policy.info().image_size);
-        let image = check(&mut findings, "environment", || check_environment(&source, program, size));
+        let image =
+            check(&mut findings, "environment", || check_environment(&source, program, size));
         if let (Some(policy), Some((image, instruction))) = (&policy, image) {
             check(&mut findings, "decision", || check_decision(policy, &image, &instruction));
         }

@@ -149,8 +149,7 @@ impl EpisodesArguments {
         let digest = policy.parser().digest().to_owned();
         let verifier = self.verifier(&folder, &digest)?;
         self.check(&request, verifier.as_deref())?;
-        let runtime =
-            tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
+        let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
         let (tasks, deployment) = self.tasks(&runtime, host)?;
         let suite = Suite {
             tasks,

@@ -7,10 +7,10 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::files::policy_folder;
-use runtime::servers::Host;
-use vla::CompletionParser;
 use evaluation::report::{self, Report, ReportOptions, Speech};
+use runtime::servers::Host;
 use store::run;
+use vla::CompletionParser;
 
 /// Episodes whose steps are written unless told otherwise: some 100 MB at the most.
 pub const EPISODES_MAX: usize = 1000;

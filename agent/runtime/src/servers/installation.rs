@@ -71,7 +71,8 @@ impl Installation {
         let home = home(&host.variables)
             .context("no folder for rever's files: set REVER_HOME or HOME to an absolute path")?;
         let root = home.join(bundle.digest.get(..DIGEST_CHARACTERS).unwrap_or(bundle.digest));
-        let mut found = Installation { root, host: host.clone(), home: Some(home), temporary: None };
+        let mut found =
+            Installation { root, host: host.clone(), home: Some(home), temporary: None };
         if !is_complete(&found.root) {
             match missing {
                 Missing::Install => unpack_once(bundle, &found.root)?,

@@ -36,9 +36,9 @@ impl Script {
         let program = ServerProgram::Python(PythonEnvironment {
             python: folder.join("python"),
             package_root: folder.to_owned(),
-            variables: BTreeMap::from(variables.map(|(name, value)| {
-                (OsString::from(name), value.to_owned())
-            })),
+            variables: BTreeMap::from(
+                variables.map(|(name, value)| (OsString::from(name), value.to_owned())),
+            ),
         });
         let options = LocalServerOptions {
             count: self.count,
@@ -162,7 +162,8 @@ fn the_processes_of_a_server_end_with_it() {
 
 #[test]
 fn the_end_of_a_server_is_noticed_though_another_process_holds_its_pipes() {
-    let script = "mkdir $FOLDER/once && { setsid sleep 30 & exit 1; }; echo ready $$; exec sleep 1000";
+    let script =
+        "mkdir $FOLDER/once && { setsid sleep 30 & exit 1; }; echo ready $$; exec sleep 1000";
     let servers = Script::new(script).start(beats).unwrap();
     assert_eq!((servers.server_ids().len(), servers.restarts()), (1, 1));
 }

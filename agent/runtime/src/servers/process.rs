@@ -12,7 +12,9 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use rustix::io::Errno;
-use rustix::process::{Pid, Resource, Signal, WaitId, WaitIdOptions, getrlimit, kill_process_group, waitid};
+use rustix::process::{
+    Pid, Resource, Signal, WaitId, WaitIdOptions, getrlimit, kill_process_group, waitid,
+};
 
 /// How much of a server's last words an error repeats.
 const STDERR_LINES_MAX: usize = 20;
@@ -168,7 +170,11 @@ fn die_with_this_thread(command: &mut Command) {
     let request = move || {
         set_parent_process_death_signal(Some(Signal::KILL))?;
         // A parent that died before the request above would never send the signal.
-        if getppid() == Some(parent) { Ok(()) } else { Err(std::io::ErrorKind::NotConnected.into()) }
+        if getppid() == Some(parent) {
+            Ok(())
+        } else {
+            Err(std::io::ErrorKind::NotConnected.into())
+        }
     };
     // SAFETY: the closure allocates nothing and takes no lock, as the time after a fork demands.
     unsafe { command.pre_exec(request) };

@@ -24,14 +24,8 @@ const PYTHON_VERSIONS_OF_UV: &str = ">=3.10,<3.15";
 const SERVERS_LOCK: &str = "requirements.lock";
 const SIMULATORS_LOCK: &str = "requirements-simulators.lock";
 const DEVELOPMENT_LOCK: &str = "requirements-development.lock";
-const PIP_INSTALL: [&str; 6] = [
-    "install",
-    "--quiet",
-    "--no-input",
-    "--disable-pip-version-check",
-    "--require-hashes",
-    "-r",
-];
+const PIP_INSTALL: [&str; 6] =
+    ["install", "--quiet", "--no-input", "--disable-pip-version-check", "--require-hashes", "-r"];
 /// How much of a failed command's output an error repeats.
 const OUTPUT_LINES_MAX: usize = 15;
 /// Renders what a server renders; an image of one colour was not rendered.
@@ -235,7 +229,12 @@ impl Setup<'_> {
         if !self.has_pip() {
             self.create_environment()?;
         }
-        self.run(self.command(&self.environment.python).args(["-m", "pip"]).args(PIP_INSTALL).arg(self.lock))
+        self.run(
+            self.command(&self.environment.python)
+                .args(["-m", "pip"])
+                .args(PIP_INSTALL)
+                .arg(self.lock),
+        )
     }
 
     fn install_with_uv(&self) -> Result<()> {
@@ -256,8 +255,9 @@ impl Setup<'_> {
     }
 
     fn create_environment(&self) -> Result<()> {
-        let attempt =
-            |python: &str| self.run(self.command(Path::new(python)).args(["-m", "venv"]).arg(self.folder));
+        let attempt = |python: &str| {
+            self.run(self.command(Path::new(python)).args(["-m", "venv"]).arg(self.folder))
+        };
         let (major, minor) = PYTHON_VERSION_MIN;
         let python = self.find_python();
         let first = match python {
@@ -295,9 +295,8 @@ impl Setup<'_> {
 
     fn run(&self, command: &mut Command) -> Result<()> {
         let program = command.get_program().to_owned();
-        let output = command
-            .output()
-            .with_context(|| format!("cannot start {}", program.display()))?;
+        let output =
+            command.output().with_context(|| format!("cannot start {}", program.display()))?;
         ensure!(
             output.status.success(),
             "{} ended with {}\n{}",

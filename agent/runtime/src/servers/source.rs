@@ -8,12 +8,12 @@ use anyhow::{Context, Result};
 use tokio::runtime::Runtime;
 
 use super::installation::{Installation, Missing};
+use super::local::{LocalServerOptions, LocalServers};
+use super::native;
 use super::program::{ServerProgram, Simulator};
 use super::python::{
     PythonEnvironment, named_environment, servers_environment, simulators_environment,
 };
-use super::local::{LocalServerOptions, LocalServers};
-use super::native;
 use crate::wire::{Network, NetworkOptions};
 
 /// A server may need nearly as long to open a session. One with episodes is found to be frozen much earlier, by the

@@ -213,9 +213,8 @@ impl Supervisor {
     }
 
     fn on_replace(&mut self, server_id: &str) {
-        let is_it = |slot: &Slot| {
-            slot.ready.as_ref().is_some_and(|ready| ready.server_id == server_id)
-        };
+        let is_it =
+            |slot: &Slot| slot.ready.as_ref().is_some_and(|ready| ready.server_id == server_id);
         if let Some(slot) = self.slots.iter().position(is_it) {
             self.replace(slot, "it did not answer");
         }
@@ -291,7 +290,9 @@ impl Supervisor {
             &mut command,
             move |line| {
                 if let Some(server_id) = line.strip_prefix("ready ") {
-                    drop(lines.send(Event::Ready { start, server_id: server_id.trim().to_owned() }));
+                    drop(
+                        lines.send(Event::Ready { start, server_id: server_id.trim().to_owned() }),
+                    );
                 }
             },
             move || drop(ended.send(Event::Ended { start })),
@@ -316,7 +317,10 @@ impl Supervisor {
             }
         }
         for running in &self.dying {
-            tracing::warn!("the server process {} was killed and did not end", running.process.id());
+            tracing::warn!(
+                "the server process {} was killed and did not end",
+                running.process.id()
+            );
         }
     }
 }

@@ -43,9 +43,8 @@ fn remove_stale_folders(parent: &Path, age_min: Duration) {
         let folder = entry.path();
         let is_named_so = entry.file_name().to_string_lossy().starts_with(FOLDER_PREFIX);
         // Anybody may put a link into a folder for temporary files.
-        let is_own = entry
-            .metadata()
-            .is_ok_and(|data| data.is_dir() && data.uid() == geteuid().as_raw());
+        let is_own =
+            entry.metadata().is_ok_and(|data| data.is_dir() && data.uid() == geteuid().as_raw());
         if !(is_named_so && is_own) {
             continue;
         }

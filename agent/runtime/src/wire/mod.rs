@@ -17,7 +17,7 @@ mod verifier_updates;
 pub use discovery::Fleet;
 pub use environment::Environment;
 pub use episode::Episode;
-pub use network::{Network, NetworkOptions, Timing};
+pub use network::{Network, NetworkOptions, Timing, check_endpoint};
 pub use outcomes::OutcomePublisher;
 pub use pool::{PoolOptions, ZenohPool};
 pub use probe::Probe;

@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, TcpListener};
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, ensure};
 use protocol::{Keys, transport};
 use tempfile::TempDir;
 use zenoh::Session;
@@ -96,6 +96,11 @@ impl Network {
     /// Opens the session. Needs a tokio runtime with several threads.
     pub async fn open(options: NetworkOptions) -> anyhow::Result<Self> {
         let keys = Keys::new(&options.fleet)?;
+        options
+            .connect
+            .iter()
+            .chain(&options.listen)
+            .try_for_each(|place| check_endpoint(place))?;
         let here = options.listen_here.then(|| local_endpoint(&tempfile::env::temp_dir()));
         let here = here.transpose()?;
         let (here, folder) = here.unzip();
@@ -151,8 +156,24 @@ impl Network {
 
     /// Ends the session; peers that watch this agent's tokens see it at once.
     pub async fn close(self) -> anyhow::Result<()> {
-        self.session.close().await.map_err(|error| anyhow!("cannot close the network: {error}"))
+        self.session
+            .close()
+            .await
+            .map_err(|error| anyhow!("cannot close the network: {}", transport::in_words(error)))
     }
+}
+
+/// An error for an endpoint that this program has no transport for; zenoh would try it for as long as it may.
+pub fn check_endpoint(endpoint: &str) -> anyhow::Result<()> {
+    let is_known = match endpoint.split_once('/') {
+        Some(("tcp", address)) => address
+            .rsplit_once(':')
+            .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok()),
+        Some(("unixsock-stream", path)) => !path.is_empty(),
+        _ => false,
+    };
+    ensure!(is_known, "endpoint {endpoint}: expected tcp/HOST:PORT or unixsock-stream/PATH");
+    Ok(())
 }
 
 async fn open_session(
@@ -166,7 +187,11 @@ async fn open_session(
         match zenoh::open(configuration).await {
             Ok(session) => return Ok((session, listening)),
             Err(error) if listening == listen || attempt == PORT_ATTEMPTS_MAX => {
-                return Err(anyhow!("cannot open the network listening on {listening:?}: {error}"));
+                let reason = transport::in_words(error);
+                return Err(match &options.connect[..] {
+                    [] => anyhow!("cannot listen on {}: {reason}", listening.join(", ")),
+                    connect => anyhow!("cannot connect to {}: {reason}", connect.join(", ")),
+                });
             }
             Err(_) => attempt += 1,
         }
@@ -189,9 +214,30 @@ fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Resu
     let NetworkOptions { connect, multicast, .. } = options;
     let mut configuration = zenoh::Config::default();
     for (key, value) in transport::settings(connect, listening, *multicast, CLIENT_WAIT_MS) {
-        configuration
-            .insert_json5(key, &value)
-            .map_err(|error| anyhow!("zenoh does not take {key} = {value}: {error}"))?;
+        configuration.insert_json5(key, &value).map_err(|error| {
+            anyhow!("zenoh does not take {key} = {value}: {}", transport::in_words(error))
+        })?;
     }
     Ok(configuration)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn endpoints_without_a_transport_are_refused() {
+        for known in ["tcp/localhost:7447", "tcp/[::1]:0", "unixsock-stream//tmp/socket"] {
+            assert!(check_endpoint(known).is_ok(), "{known}");
+        }
+        for unknown in
+            ["", "localhost:7447", "tcp/localhost", "tcp/:1", "tcp/a:99999", "tls/a:1", "udp/a:1"]
+        {
+            let error = check_endpoint(unknown).expect_err("no transport").to_string();
+            assert!(
+                error.starts_with(&format!("endpoint {unknown}: expected tcp/HOST:PORT")),
+                "{error}"
+            );
+        }
+    }
 }
