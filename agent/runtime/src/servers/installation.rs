@@ -164,3 +164,92 @@ fn unpack(bundle: &Bundle, folder: &Path) -> Result<()> {
 fn temporary_folder() -> Result<TempDir> {
     tempfile::Builder::new().prefix("rever-files-").tempdir().context("no temporary folder")
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use flate2::{Compression, write::GzEncoder};
+
+    use super::*;
+
+    /// An archive with the landmarks alone.
+    fn bundle() -> Bundle {
+        let mut archive = tar::Builder::new(GzEncoder::new(Vec::new(), Compression::fast()));
+        for name in LANDMARKS {
+            let mut header = tar::Header::new_gnu();
+            header.set_size(1);
+            header.set_mode(0o644);
+            archive.append_data(&mut header, name, &b"x"[..]).unwrap();
+        }
+        let mut encoder = archive.into_inner().unwrap();
+        encoder.flush().unwrap();
+        let archive = encoder.finish().unwrap().leak();
+        Bundle { archive, digest: "0123456789abcdef" }
+    }
+
+    fn host(folder: &Path) -> Host {
+        let home = folder.join("home");
+        Host {
+            program: Some(folder.join("bin/rever")),
+            folder: Some(folder.join("work")),
+            variables: BTreeMap::from([("HOME".into(), home.into())]),
+        }
+    }
+
+    #[test]
+    fn embedded_files_are_unpacked_once_into_the_data_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let host = host(folder.path());
+        let found = Installation::find(&host, &bundle(), Missing::Install).unwrap();
+        assert_eq!(found.root, folder.path().join("home/.local/share/rever/0123456789ab"));
+        assert!(is_complete(&found.root) && !found.is_checkout() && !found.is_temporary());
+        let mine = found.root.join("mine");
+        std::fs::write(&mine, "").unwrap();
+        let again = Installation::find(&host, &bundle(), Missing::Install).unwrap();
+        assert_eq!(again.root, found.root);
+        assert!(mine.exists());
+        let data = found.root.parent().unwrap();
+        assert_eq!(data.read_dir().unwrap().count(), 1, "nothing half unpacked is left");
+    }
+
+    #[test]
+    fn nothing_is_left_where_nothing_may_be_changed() {
+        let folder = tempfile::tempdir().unwrap();
+        let found =
+            Installation::find(&host(folder.path()), &bundle(), Missing::Report).unwrap();
+        assert!(is_complete(&found.root) && found.is_temporary());
+        let root = found.root.clone();
+        drop(found);
+        assert!(!root.exists());
+        assert_eq!(folder.path().read_dir().unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_checkout_around_the_program_or_the_current_folder_is_used() {
+        let folder = tempfile::tempdir().unwrap();
+        for place in ["bin", "work"] {
+            let checkout = folder.path().join(place);
+            unpack(&bundle(), &checkout).unwrap();
+            let found =
+                Installation::find(&host(folder.path()), &bundle(), Missing::Install).unwrap();
+            assert_eq!(found.root, checkout);
+            assert!(found.is_checkout());
+            std::fs::remove_dir_all(checkout).unwrap();
+        }
+        assert_eq!(folder.path().read_dir().unwrap().count(), 0);
+    }
+
+    #[test]
+    fn the_data_folder_follows_the_users_variables() {
+        let check = |variables: &[(&str, &str)], expected: Option<&str>| {
+            let variables = variables.iter().map(|(name, value)| (name.into(), value.into()));
+            assert_eq!(home(&variables.collect()), expected.map(PathBuf::from));
+        };
+        check(&[], None);
+        check(&[("HOME", "/a")], Some("/a/.local/share/rever"));
+        check(&[("HOME", "/a"), ("XDG_DATA_HOME", "/b")], Some("/b/rever"));
+        check(&[("HOME", "/a"), ("XDG_DATA_HOME", "b")], Some("/a/.local/share/rever"));
+        check(&[("HOME", "/a"), ("REVER_HOME", "/c")], Some("/c"));
+    }
+}

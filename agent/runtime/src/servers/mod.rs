@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! installation  the program's own files: a checkout, or unpacked from the program
-//!   python      Python with pinned packages       system_packages   software OpenGL
+//!   python      Python for servers ─▶ packages    system_packages   software OpenGL
 //!   native      the program rever-simulator       variables         what servers see of the environment
 //! program       a simulator that can be started
 //!   supervisor  its processes: started, watched, started again ─▶ process
@@ -12,6 +12,7 @@
 mod installation;
 mod local;
 mod native;
+mod packages;
 mod process;
 mod program;
 mod python;
@@ -29,5 +30,4 @@ pub use python::{
     simulators_environment,
 };
 pub use source::{Deployment, LocalSource, ServerSource};
-
 pub use system_packages::GL_PACKAGES;
