@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use agent::setup::GL_PACKAGES;
+use runtime::servers::GL_PACKAGES;
 
 use crate::harness::{repository, succeed};
 

@@ -5,7 +5,10 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use agent::setup::{PythonEnvironment, development_environment};
+use runtime::servers::{
+    Host, Installation, LocalSource, Missing, PythonEnvironment, ServerProgram, Simulator,
+    development_environment,
+};
 
 /// How often a condition is looked at while a test waits for it.
 const LOOK_MS: u64 = 20;
@@ -44,7 +47,20 @@ pub fn cargo() -> Command {
 /// Python with the servers' packages and the tools of the tests, and software OpenGL.
 pub fn python() -> &'static PythonEnvironment {
     static ENVIRONMENT: OnceLock<PythonEnvironment> = OnceLock::new();
-    ENVIRONMENT.get_or_init(|| development_environment(repository()).expect("Python is set up"))
+    ENVIRONMENT.get_or_init(|| development_environment(&installation()).expect("Python is set up"))
+}
+
+/// This checkout, with the variables of this process.
+pub fn installation() -> Installation {
+    let variables = std::env::vars_os().collect();
+    Installation::checkout(repository(), &Host { variables, ..Host::default() })
+}
+
+/// A simulator, installed or built if need be.
+pub fn simulator(simulator: Simulator) -> ServerProgram {
+    let python = (simulator != Simulator::Robosuite).then(|| python().python.clone());
+    let local = LocalSource { count: 1, simulator, python, installation: installation() };
+    local.program(Missing::Install).expect("the simulator can be started")
 }
 
 /// Runs the command to its end and returns its standard output.

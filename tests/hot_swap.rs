@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use decision::TaskId;
 use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
 use store::record::EpisodeRecord;
 use verifier::training::{LayoutKey, TrainingEpisode, TrainingSet, train};
@@ -95,9 +96,8 @@ fn verifier(policy: &str, seed: u64) -> Verifier {
         let value = |index: usize| ((index * 7919 + number * 104_729) % 1000) as f32 / 1000.0;
         TrainingEpisode {
             name: format!("episode {number}"),
-            layout: LayoutKey {
-                task: "widowx_spoon_on_towel".to_owned(),
-                variant: "default".to_owned(),
+            start: LayoutKey {
+                task: TaskId::default_of("widowx_spoon_on_towel"),
                 layout: None,
                 seed: number as u64,
             },

@@ -1,6 +1,6 @@
 //! Formats, lints and types of both languages; a warning fails.
 
-use agent::simulator::libmujoco;
+use runtime::servers::libmujoco;
 
 use crate::harness::{cargo, python, repository, succeed};
 

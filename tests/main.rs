@@ -23,6 +23,10 @@ mod wire;
 // The native simulator beside the Python one, and the test of servers.
 mod simulators;
 
+// The program away from its checkout; servers of this machine that freeze.
+mod installation;
+mod local_servers;
+
 // Evaluations with the models that come with the program: results, kills, faults, the report.
 mod whole_loop;
 

@@ -2,9 +2,9 @@
 
 use std::io::Write;
 
-use agent::setup::{PythonEnvironment, simulators_environment};
+use runtime::servers::{Missing, PythonEnvironment, simulators_environment};
 
-use crate::harness::{python, repository, succeed};
+use crate::harness::{installation, python, repository, succeed};
 
 #[test]
 fn the_environment_server_passes_its_tests() {
@@ -13,7 +13,8 @@ fn the_environment_server_passes_its_tests() {
 
 #[test]
 fn the_other_simulators_pass_their_tests() {
-    let environment = simulators_environment(repository()).expect("the simulators are set up");
+    let environment = simulators_environment(&installation(), Missing::Install)
+        .expect("the simulators are set up");
     pytest(&environment, &["tests/test_robosuite.py", "tests/test_gymnasium_world.py"]);
 }
 

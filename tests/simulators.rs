@@ -6,11 +6,10 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
-use agent::setup::simulators_environment;
-use agent::simulator::{ServerProgram, Simulator};
+use runtime::servers::{Missing, ServerProgram, Simulator, simulators_environment};
 use serde_json::Value;
 
-use crate::harness::{python, repository, rever, run, succeed, text};
+use crate::harness::{installation, python, repository, rever, run, simulator, succeed, text};
 use crate::server::free_endpoint;
 
 /// Rows of the suite that a server with the defects must fail, and no others.
@@ -46,9 +45,7 @@ const BROKEN: [(&str, &[&str]); 7] = [
 /// Built once.
 fn native() -> &'static ServerProgram {
     static PROGRAM: OnceLock<ServerProgram> = OnceLock::new();
-    PROGRAM.get_or_init(|| {
-        ServerProgram::prepare(Simulator::Native, python().clone()).expect("it is built")
-    })
+    PROGRAM.get_or_init(|| simulator(Simulator::Native))
 }
 
 fn trace(program: &ServerProgram, arguments: &[&str]) -> Vec<Value> {
@@ -126,7 +123,9 @@ const WRONG_TASKS: [(&str, &str, &str); 5] = [
 
 #[test]
 fn both_name_the_key_that_is_wrong_in_the_description_of_the_tasks() {
-    let ServerProgram::Native { program, assets } = native() else { unreachable!("it is native") };
+    let ServerProgram::Native { program, assets, .. } = native() else {
+        unreachable!("it is native")
+    };
     let whole = std::fs::read_to_string(assets.join("tasks.toml")).expect("it can be read");
     let folder = tempfile::tempdir().expect("a folder");
     for (after, added, named) in WRONG_TASKS {
@@ -179,7 +178,8 @@ fn our_servers_conform() {
 
 #[test]
 fn a_gymnasium_environment_conforms() {
-    let python = simulators_environment(repository()).expect("the simulators are set up");
+    let python = simulators_environment(&installation(), Missing::Install)
+        .expect("the simulators are set up");
     let mut command = python.command();
     command.args(["-m", "rever_env", "serve", "--gymnasium", "CartPole-v1"]);
     let (failed, passed, said) = conformance_of(&mut command);

@@ -65,7 +65,11 @@ async fn connect_through(endpoint: &str, timing: Timing) -> Network {
     let (connect, fleet) = (vec![endpoint.to_owned()], "agents".to_owned());
     let options = NetworkOptions { connect, fleet, timing, ..NetworkOptions::default() };
     let network = Network::open(options).await.expect("the network opens");
-    assert_eq!(network.servers(1, WAIT).await.servers.len(), 1, "the server is seen through the relay");
+    assert_eq!(
+        network.servers(1, WAIT).await.servers.len(),
+        1,
+        "the server is seen through the relay"
+    );
     network
 }
 
@@ -206,7 +210,11 @@ async fn a_session_dies_with_its_holder() {
     let _episode = environment.reset(spoon()).await.expect("an episode");
     assert_eq!(sessions_become(&network, &server.id, 1).await, 1, "the session is not counted");
     holder.close().await.expect("the holder goes");
-    assert_eq!(sessions_become(&network, &server.id, 0).await, 0, "the session lives on without its holder");
+    assert_eq!(
+        sessions_become(&network, &server.id, 0).await,
+        0,
+        "the session lives on without its holder"
+    );
     Environment::open(&network, &server.id, open()).await.expect("the session is free again");
 }
 

@@ -1,18 +1,41 @@
-//! Tells the program the commit that it is built from, and when.
+//! Tells the program the commit that it is built from, and when, and packs the files that it carries.
 
+#![allow(clippy::disallowed_methods, reason = "cargo tells a build script everything in variables")]
+
+use std::error::Error;
+use std::fs::File;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, SystemTime};
 
+use flate2::{Compression, write::GzEncoder};
+use sha2::{Digest, Sha256};
+use tar::{Builder, Header};
+
 /// Seconds since 1970, set where builds must be reproducible.
 const SOURCE_DATE: &str = "SOURCE_DATE_EPOCH";
+const ROOT: &str = "../..";
+/// Files and folders that environment servers and the shipped policy are made of, as they are in a checkout.
+const CARRIED: [&str; 8] = [
+    "env-server/assets",
+    "env-server/requirements.lock",
+    "env-server/requirements-simulators.lock",
+    "env-server/rever_env",
+    "agent/models/bridge-small/config.json",
+    "agent/models/bridge-small/model.safetensors",
+    "agent/models/bridge-small/tokenizer.json",
+    "agent/models/bridge-small/verifier.safetensors",
+];
 
-fn main() {
-    for place in ["../../.git/HEAD", "../../.git/index", "..", "../../protocol/src"] {
-        println!("cargo::rerun-if-changed={place}");
+fn main() -> Result<(), Box<dyn Error>> {
+    for place in [".git/HEAD", ".git/index", "agent", "protocol/src"].iter().chain(&CARRIED) {
+        println!("cargo::rerun-if-changed={ROOT}/{place}");
     }
     println!("cargo::rerun-if-env-changed={SOURCE_DATE}");
     println!("cargo::rustc-env=REVER_COMMIT={}", commit());
     println!("cargo::rustc-env=REVER_BUILD_DATE={}", date());
+    println!("cargo::rustc-env=REVER_FILES_DIGEST={}", pack()?);
+    Ok(())
 }
 
 /// The commit, with `-dirty` where files differ from it; empty outside of a checkout.
@@ -29,4 +52,35 @@ fn date() -> String {
     let asked = std::env::var(SOURCE_DATE).ok().and_then(|secs| secs.parse().ok());
     let time = asked.map(|secs| SystemTime::UNIX_EPOCH + Duration::from_secs(secs));
     humantime::format_rfc3339_seconds(time.unwrap_or_else(SystemTime::now)).to_string()
+}
+
+/// Writes the archive and returns its digest; the same files give the same bytes.
+fn pack() -> Result<String, Box<dyn Error>> {
+    let folder = PathBuf::from(std::env::var("OUT_DIR")?);
+    let path = folder.join("files.tar.gz");
+    let mut archive = Builder::new(GzEncoder::new(File::create(&path)?, Compression::best()));
+    for place in CARRIED {
+        append(&mut archive, Path::new(place))?;
+    }
+    archive.into_inner()?.finish()?;
+    let digest = Sha256::digest(std::fs::read(&path)?);
+    Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+fn append(archive: &mut Builder<GzEncoder<File>>, place: &Path) -> Result<(), Box<dyn Error>> {
+    let path = Path::new(ROOT).join(place);
+    if path.is_dir() {
+        let entries: Result<Vec<_>, _> = path.read_dir()?.collect();
+        let mut names: Vec<_> = entries?.into_iter().map(|entry| entry.file_name()).collect();
+        names.sort();
+        for name in names.iter().filter(|name| *name != "__pycache__") {
+            append(archive, &place.join(name))?;
+        }
+        return Ok(());
+    }
+    let bytes = std::fs::read(&path)?;
+    let mut header = Header::new_gnu();
+    header.set_size(bytes.len() as u64);
+    header.set_mode(0o644);
+    Ok(archive.append_data(&mut header, place, bytes.as_slice())?)
 }

@@ -1,5 +1,7 @@
 //! How both sides configure zenoh: this machine and nothing else unless told otherwise, and the limits on messages.
 
+use std::fmt::Display;
+
 use crate::limits::MESSAGE_BYTES_MAX;
 
 /// A variable of the environment, from which alone zenoh takes its threads. To be set before zenoh is used.
@@ -50,6 +52,39 @@ pub fn settings(
     entries
 }
 
+/// What zenoh says of an error, without the places in its sources: they are paths of the machine that built the program.
+pub fn in_words(error: impl Display) -> String {
+    let text = error.to_string();
+    let (mut words, mut rest) = (String::new(), text.as_str());
+    // ERROR at FILE.rs:LINE. - Caused by ...
+    while let Some((before, after)) = rest.split_once(".rs:") {
+        let line_end = after.find(|next: char| !next.is_ascii_digit()).unwrap_or(after.len());
+        let start = before.rfind(" at ").unwrap_or(before.len());
+        words.push_str(&before[..start]);
+        rest = after[line_end..].strip_prefix('.').unwrap_or(&after[line_end..]);
+    }
+    words + rest
+}
+
 fn json(endpoints: &[String]) -> String {
     serde_json::to_string(endpoints).expect("texts can be written as JSON")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::in_words;
+
+    #[test]
+    fn an_error_of_zenoh_names_no_file_of_the_machine_that_built_it() {
+        let check = |text, expected| assert_eq!(in_words(text), expected);
+        check("Timeout!", "Timeout!");
+        check(
+            "no link at tcp/a:1 at /home/a b/.cargo/zenoh-1.10.2/src/net.rs:12.",
+            "no link at tcp/a:1",
+        );
+        check(
+            "lost at /x/a.rs:12. - Caused by refused at /x/b.rs:345.",
+            "lost - Caused by refused",
+        );
+    }
 }

@@ -7,20 +7,23 @@
 mod bench;
 mod build_info;
 mod command;
+mod files;
+mod panics;
 
 use std::process::ExitCode;
 
 use clap::Parser;
 use command::Program;
+use runtime::servers::Host;
 
 fn main() -> ExitCode {
-    exit_quietly_on_broken_pipe();
+    panics::report_panics();
     // Wrong usage ends inside `parse`, with status 2 and a message that says what was expected.
     let program = Program::parse();
     #[expect(clippy::disallowed_methods, reason = "this is main")]
     let filter = std::env::var("REVER_LOG").ok();
     command::start_log(filter.as_deref());
-    match program.run() {
+    match program.run(&host()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
@@ -29,13 +32,11 @@ fn main() -> ExitCode {
     }
 }
 
-/// In `rever ... | head`, `head` has seen enough: that ends the program and is no defect to be reported.
-fn exit_quietly_on_broken_pipe() {
-    let report = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |panic| {
-        let message = panic.payload_as_str().unwrap_or_default();
-        if !(message.starts_with("failed printing to std") && message.contains("Broken pipe")) {
-            report(panic);
-        }
-    }));
+/// All that is read of the surroundings, apart from the arguments.
+fn host() -> Host {
+    Host {
+        program: std::env::current_exe().ok(),
+        folder: std::env::current_dir().ok(),
+        variables: std::env::vars_os().collect(),
+    }
 }

@@ -16,8 +16,8 @@ use tokio::runtime::Runtime;
 use tokio::sync::watch;
 
 use crate::rollout::{RecordOptions, Rollout};
+use crate::servers::Deployment;
 use crate::sinks::{EventSink, OutcomeSink, Progress, Sinks, StoreSink, VideoSink};
-use crate::site::Deployment;
 use crate::stop::{self, Stop};
 use crate::wire::{Fleet, OutcomePublisher, PoolOptions, VerifierSubscriber, ZenohPool};
 
@@ -189,12 +189,12 @@ impl Experiment {
         &self,
         deployment: &Deployment,
     ) -> Result<(Scorers, Option<VerifierSubscriber>)> {
-        let Deployment { network, site, .. } = deployment;
+        let Deployment { network, source, .. } = deployment;
         let (sender, scorers) = watch::channel(self.scorer.clone());
         let Some((name, load)) = &self.follow_verifier else { return Ok((scorers, None)) };
         let follower = VerifierSubscriber::declare(network, name).await?;
         let listening = network.listening();
-        let places = if listening.is_empty() { &site.connect[..] } else { listening };
+        let places = if listening.is_empty() { &source.connect[..] } else { listening };
         eprintln!("waiting for versions of verifier {name} at {}", places.join(", "));
         let mut latest = follower.latest();
         latest.mark_changed();
@@ -264,16 +264,16 @@ pub async fn default_tasks(deployment: &Deployment) -> Result<Vec<TaskId>> {
 
 /// The servers that are found within the discovery timeout; an error when there is none.
 async fn first_servers(deployment: &Deployment) -> Result<Fleet> {
-    let Deployment { site, network, .. } = deployment;
-    let fleet = network.servers(site.servers.max(1), SERVERS_WAIT).await;
+    let Deployment { source, network, .. } = deployment;
+    let fleet = network.servers(source.local_count().max(1), SERVERS_WAIT).await;
     if !fleet.servers.is_empty() {
         return Ok(fleet);
     }
-    let place = match &site.connect[..] {
+    let place = match &source.connect[..] {
         [] => String::new(),
         connect => format!(" at {}", connect.join(", ")),
     };
-    let mut text = format!("no environment server found{place} (fleet {:?})", site.fleet);
+    let mut text = format!("no environment server found{place} (fleet {:?})", source.fleet);
     for (server, reason) in &fleet.undescribed {
         text.push_str(&format!("; server {server}: {reason}"));
     }

@@ -3,7 +3,7 @@
 use std::fmt;
 
 use decision::DecisionFault;
-use protocol::{CodecError, FaultKind};
+use protocol::{CodecError, FaultKind, transport};
 use store::queue::FaultScope;
 use thiserror::Error;
 
@@ -51,7 +51,7 @@ pub enum EnvironmentFault {
 
 impl EnvironmentFault {
     pub(crate) fn wire(error: impl fmt::Display) -> Self {
-        EnvironmentFault::Wire { reason: printable(&error.to_string()) }
+        EnvironmentFault::Wire { reason: printable(&transport::in_words(error)) }
     }
 
     pub(crate) fn refused(reason: &str) -> Self {

@@ -25,9 +25,6 @@ pub mod sinks;
 
 // Servers on this machine.
 pub mod servers;
-pub mod setup;
-pub mod simulator;
-pub mod site;
 
 #[cfg(test)]
 mod tests {

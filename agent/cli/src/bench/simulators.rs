@@ -8,9 +8,7 @@ use serde::Serialize;
 
 use super::wire::{EPISODE_STEPS, WARM_UP_STEPS, at_once, circling, default_tasks, open, reset};
 use evaluation::statistics::quantile;
-use runtime::servers::LocalServers;
-use runtime::simulator::{ServerProgram, Simulator};
-use runtime::site::Site;
+use runtime::servers::{LocalServers, LocalSource, Missing, ServerSource, Simulator};
 use runtime::wire::{Environment, Episode, Network};
 
 /// Local servers are on the network already.
@@ -36,7 +34,7 @@ pub struct Row {
 /// What is timed.
 pub struct SimulatorsBench<'a> {
     /// Where the servers are started; its own simulator does not matter.
-    pub site: &'a Site,
+    pub servers: &'a ServerSource,
     /// Numbers of sessions.
     pub sessions: &'a [usize],
     /// Control steps of every session.
@@ -51,13 +49,14 @@ impl SimulatorsBench<'_> {
         ensure!(self.steps > 0, "steps: expected at least 1, got 0");
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
         let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
+        let local = self.servers.local.as_ref().context("servers: expected some to start")?;
         let programs = [Simulator::Python, Simulator::Native]
-            .map(|simulator| ServerProgram::prepare(simulator, self.site.python_environment()?));
+            .map(|simulator| LocalSource { simulator, ..local.clone() }.program(Missing::Install));
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let network = runtime.block_on(Network::open(self.site.network_options()))?;
+        let network = runtime.block_on(Network::open(self.servers.network_options()))?;
         let mut servers = Vec::new();
         for program in programs {
-            servers.push(self.site.start(program?, &network, most)?);
+            servers.push(self.servers.start(program?, &network, most)?);
         }
         let rows = runtime.block_on(self.rows(&network, &servers, most));
         // Servers first: they would report the network's end as an error.

@@ -9,8 +9,8 @@ use decision::{Decider, Policy, Scorer, Setting, Strategy, TaskId};
 use evaluation::suite::{Layouts, Suite};
 use runtime::experiment::{default_tasks, pool_options};
 use runtime::rollout::{RecordOptions, Rollout};
+use runtime::servers::{Deployment, ServerSource};
 use runtime::sinks::{Counts, OutcomeSink, Progress, Sinks, StoreSink};
-use runtime::site::{Deployment, Site};
 use runtime::stop::Stop;
 use runtime::wire::{OutcomePublisher, ZenohPool};
 use serde::Serialize;
@@ -52,7 +52,7 @@ pub struct ThroughputBench<'a> {
     /// Scores.
     pub verifier: Arc<Verifier>,
     /// Where the servers are started.
-    pub site: &'a Site,
+    pub servers: &'a ServerSource,
     /// Numbers of episodes at once.
     pub sessions: &'a [usize],
     /// Counted for each of them.
@@ -68,7 +68,7 @@ impl ThroughputBench<'_> {
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
         let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let deployment = self.site.open(&runtime, most)?;
+        let deployment = self.servers.open(&runtime, most)?;
         let rows = runtime.block_on(self.rows(&deployment));
         deployment.close(&runtime)?;
         rows

@@ -20,8 +20,7 @@ use tokio::task::JoinSet;
 
 use evaluation::statistics::quantile;
 use runtime::fault::EnvironmentFault;
-use runtime::simulator::Simulator;
-use runtime::site::Site;
+use runtime::servers::{ServerSource, Simulator};
 use runtime::wire::{Environment, Episode, Network};
 use store::plan::SeedRange;
 
@@ -67,7 +66,7 @@ pub struct Row {
 /// What is timed.
 pub struct WireBench<'a> {
     /// Where the server is started.
-    pub site: &'a Site,
+    pub servers: &'a ServerSource,
     /// Numbers of sessions.
     pub sessions: &'a [usize],
     /// Control steps of every session.
@@ -83,7 +82,7 @@ impl WireBench<'_> {
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
         let most = self.sessions.iter().copied().max().context("sessions: expected some")?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let deployment = self.site.open(&runtime, most)?;
+        let deployment = self.servers.open(&runtime, most)?;
         let rows = runtime.block_on(self.rows(&deployment.network, most));
         deployment.close(&runtime)?;
         rows
@@ -151,8 +150,9 @@ impl WireBench<'_> {
         {
             figures.sort_by(f64::total_cmp);
         }
+        let local = self.servers.local.as_ref().context("servers: expected one to start")?;
         let row = Row {
-            simulator: self.site.simulator,
+            simulator: local.simulator,
             sessions,
             steps: self.steps * sessions,
             step_ms_p50: quantile(&stepped, 0.5),

@@ -7,17 +7,15 @@ use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
-use runtime::setup;
-use runtime::simulator::Simulator;
-use runtime::site::Site;
+use runtime::servers::{Host, LocalSource, ServerSource, Simulator};
 use verifier::Verifier;
 use vla::{DeviceName, Vla};
 
-use super::episodes::policy_folder;
 use crate::bench::{
     DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench, read_observations,
 };
 use crate::build_info;
+use crate::files::{self, policy_folder};
 
 /// What the parts of the program cost on this machine.
 #[derive(Debug, Args)]
@@ -139,24 +137,24 @@ struct StepsArguments {
 }
 
 /// Times what was asked for and prints a table.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     match arguments.part {
-        Part::Decision(arguments) => decision(arguments),
-        Part::Throughput(arguments) => throughput(arguments),
-        Part::Wire(arguments) => wire(arguments),
-        Part::Simulators(arguments) => simulators(arguments),
+        Part::Decision(arguments) => decision(arguments, host),
+        Part::Throughput(arguments) => throughput(arguments, host),
+        Part::Wire(arguments) => wire(arguments, host),
+        Part::Simulators(arguments) => simulators(arguments, host),
     }?;
     println!("commit {}", build_info::build().commit_text());
     Ok(())
 }
 
-fn wire(arguments: WireArguments) -> Result<()> {
+fn wire(arguments: WireArguments, host: &Host) -> Result<()> {
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
     let (steps, side) = (arguments.steps.steps as usize, arguments.steps.side);
     let mut rows = Vec::new();
     for &simulator in &arguments.simulator {
-        let site = site(1, simulator, arguments.steps.python.clone());
-        rows.extend(WireBench { site: &site, sessions: &sessions, steps, side }.run()?);
+        let servers = servers(host, 1, simulator, arguments.steps.python.clone())?;
+        rows.extend(WireBench { servers: &servers, sessions: &sessions, steps, side }.run()?);
     }
     if let Some(path) = &arguments.steps.json {
         write_json(path, serde_json::json!({ "side": side, "rows": rows }))?;
@@ -198,12 +196,16 @@ fn wire(arguments: WireArguments) -> Result<()> {
     Ok(())
 }
 
-fn simulators(arguments: SimulatorsArguments) -> Result<()> {
-    let site = site(1, Simulator::Python, arguments.steps.python.clone());
+fn simulators(arguments: SimulatorsArguments, host: &Host) -> Result<()> {
+    let servers = servers(host, 1, Simulator::Python, arguments.steps.python.clone())?;
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
     let steps = arguments.steps.steps as usize;
-    let bench =
-        SimulatorsBench { site: &site, sessions: &sessions, steps, side: arguments.steps.side };
+    let bench = SimulatorsBench {
+        servers: &servers,
+        sessions: &sessions,
+        steps,
+        side: arguments.steps.side,
+    };
     let rows = bench.run()?;
     if let Some(path) = &arguments.steps.json {
         write_json(path, serde_json::json!({ "rows": rows }))?;
@@ -229,21 +231,33 @@ fn simulators(arguments: SimulatorsArguments) -> Result<()> {
 }
 
 /// Servers of this benchmark alone.
-fn site(servers: usize, simulator: Simulator, python: Option<PathBuf>) -> Site {
-    Site { servers, simulator, python, fleet: "bench".to_owned(), ..Site::default() }
+fn servers(
+    host: &Host,
+    count: usize,
+    simulator: Simulator,
+    python: Option<PathBuf>,
+) -> Result<ServerSource> {
+    let installation = files::installation(host)?;
+    Ok(ServerSource {
+        local: Some(LocalSource { count, simulator, python, installation }),
+        connect: Vec::new(),
+        listen: Vec::new(),
+        fleet: "bench".to_owned(),
+    })
 }
 
-fn throughput(arguments: ThroughputArguments) -> Result<()> {
-    let folder = policy_folder(arguments.policy.as_ref())?;
+fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
+    let folder = policy_folder(arguments.policy.as_ref(), host)?;
     let policy = Vla::load(&folder, arguments.device)?;
     let file = folder.join("verifier.safetensors");
     let verifier = Verifier::load(&file, policy.parser().digest())?;
-    let site = site(usize::from(arguments.servers), arguments.simulator, arguments.python);
+    let count = usize::from(arguments.servers);
+    let servers = servers(host, count, arguments.simulator, arguments.python)?;
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
     let bench = ThroughputBench {
         policy: Arc::new(policy),
         verifier: Arc::new(verifier),
-        site: &site,
+        servers: &servers,
         sessions: &sessions,
         decisions: arguments.decisions,
         candidates: arguments.candidates,
@@ -278,23 +292,23 @@ fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
     std::fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
 }
 
-fn decision(arguments: DecisionArguments) -> Result<()> {
+fn decision(arguments: DecisionArguments, host: &Host) -> Result<()> {
     ensure!(
         !arguments.compare || arguments.device == DeviceName::Cpu,
         "--compare: expected --device cpu, where PyTorch runs, got {}",
         arguments.device
     );
-    let folder = policy_folder(arguments.policy.as_ref())?;
+    let folder = policy_folder(arguments.policy.as_ref(), host)?;
     let file = arguments.verifier.unwrap_or_else(|| folder.join("verifier.safetensors"));
     let policy = Vla::load(&folder, arguments.device)?;
     let verifier = Verifier::load(&file, policy.parser().digest())?;
     let recorded = match arguments.observations {
         Some(file) => file,
-        None => setup::repository()?.join("agent/vla/tests/fixtures/bridge-small.safetensors"),
+        None => files::of_checkout(host, "agent/vla/tests/fixtures/bridge-small.safetensors")?,
     };
     let observations = read_observations(&recorded)?;
     let torch = if arguments.compare {
-        let script = setup::repository()?.join("agent/training/bench.py");
+        let script = files::of_checkout(host, "agent/training/bench.py")?;
         Some(Torch::start(&arguments.python, &script, &folder, &recorded)?)
     } else {
         None

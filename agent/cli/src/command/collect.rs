@@ -6,6 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use decision::{Setting, Strategy};
 use evaluation::suite::Layouts;
+use runtime::servers::Host;
 use store::plan::SeedRange;
 
 use super::episodes::{EpisodesArguments, Request};
@@ -34,7 +35,7 @@ pub struct Arguments {
 }
 
 /// Runs what is missing, then prints how many episodes succeeded.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let Arguments { strategy, candidates, temperature, .. } = arguments;
     let setting = match strategy {
         // In an evaluation the candidates beside a sample would be a waste of time; here a verifier is trained on them.
@@ -43,13 +44,16 @@ pub fn run(arguments: Arguments) -> Result<()> {
     };
     let mut episodes_arguments = arguments.episodes_arguments;
     episodes_arguments.all_hidden |= strategy == Strategy::Sample;
-    let outcome = episodes_arguments.run(Request {
-        title: "collect",
-        episodes: arguments.episodes,
-        layouts: Layouts::Random,
-        range: SeedRange::Collection,
-        settings: vec![setting],
-    })?;
+    let outcome = episodes_arguments.run(
+        host,
+        Request {
+            title: "collect",
+            episodes: arguments.episodes,
+            layouts: Layouts::Random,
+            range: SeedRange::Collection,
+            settings: vec![setting],
+        },
+    )?;
     println!("labels: {}", episodes_arguments.labels.display());
     show(&outcome, arguments.json.as_deref())
 }

@@ -6,8 +6,9 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 
 use conformance::{Row, Verdict, test};
-use runtime::simulator::Simulator;
-use runtime::site::Site;
+use runtime::servers::{Host, LocalSource, ServerSource, Simulator};
+
+use crate::files;
 
 /// Test a server against the protocol's specification, row by row
 #[derive(Debug, Args)]
@@ -36,21 +37,23 @@ pub struct Arguments {
 const SESSIONS: usize = 4;
 
 /// Prints each row when it is done; an error when one fails.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     if arguments.server.is_none() && arguments.connect.is_empty() {
         bail!("expected --server or --connect, got none");
     }
-    let site = Site {
-        servers: usize::from(arguments.server.is_some()),
-        simulator: arguments.server.unwrap_or_default(),
+    let start = |simulator| -> Result<LocalSource> {
+        let installation = files::installation(host)?;
+        Ok(LocalSource { count: 1, simulator, python: arguments.python, installation })
+    };
+    let source = ServerSource {
+        local: arguments.server.map(start).transpose()?,
         connect: arguments.connect,
+        listen: Vec::new(),
         fleet: arguments.fleet,
-        python: arguments.python,
-        ..Site::default()
     };
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
     let id = arguments.id;
-    let deployment = site.open(&runtime, SESSIONS)?;
+    let deployment = source.open(&runtime, SESSIONS)?;
     let rows = runtime.block_on(test(&deployment.network, id.as_deref(), &mut print));
     deployment.close(&runtime)?;
     let rows = rows?;

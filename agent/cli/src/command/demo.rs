@@ -9,6 +9,7 @@ use decision::{Setting, Strategy};
 use evaluation::result_file::ResultFile;
 use evaluation::suite::Layouts;
 use evaluation::table;
+use runtime::servers::Host;
 use store::plan::SeedRange;
 
 use super::episodes::{EpisodesArguments, Request};
@@ -42,7 +43,7 @@ pub struct Arguments {
 }
 
 /// Runs the demonstration, prints its tables and where its page is.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let started = Instant::now();
     println!(
         "{} random layouts of each task, each with a single sample and with the verifier's choice of {CANDIDATES}",
@@ -58,13 +59,16 @@ pub fn run(arguments: Arguments) -> Result<()> {
         python: arguments.python,
         ..EpisodesArguments::default()
     };
-    let outcome = episodes.run(Request {
-        title: "demo",
-        episodes: arguments.episodes,
-        layouts: Layouts::Random,
-        range: SeedRange::Evaluation,
-        settings: vec![setting(Strategy::Sample), setting(Strategy::Verifier)],
-    })?;
+    let outcome = episodes.run(
+        host,
+        Request {
+            title: "demo",
+            episodes: arguments.episodes,
+            layouts: Layouts::Random,
+            range: SeedRange::Evaluation,
+            settings: vec![setting(Strategy::Sample), setting(Strategy::Verifier)],
+        },
+    )?;
     let out = outcome.folder.join("report");
     let page = report::build(&outcome.folder, &out, &outcome.policy, report::EPISODES_MAX)?;
     println!("\n{}", table::text(&outcome.results));

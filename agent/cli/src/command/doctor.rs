@@ -1,28 +1,32 @@
-//! `rever doctor`: tries everything that a run needs, one thing after the other, and says what to do.
+//! `rever doctor`: tries everything that a run needs, one thing after the other, and says what is missing.
+//!
+//! It changes nothing on the machine: what is missing is named with the line that installs it.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow, ensure};
 use clap::Args;
+use decision::{ActionSpace, Image, Policy, ProposalRequest};
 use protocol::{Open, PROTOCOL_VERSION, Reset};
-use serde::Serialize;
-
-use super::episodes::policy_folder;
-use decision::{ActionSpace, Policy};
-use decision::{Image, ProposalRequest};
-use runtime::setup::{self, PythonEnvironment};
-use runtime::simulator::{ServerProgram, Simulator};
-use runtime::site::Site;
+use runtime::servers::{
+    Host, LocalSource, Missing, PythonEnvironment, ServerProgram, ServerSource, Simulator,
+};
 use runtime::wire::{Environment, Network, ServerDescription};
+use serde::Serialize;
 use store::plan::SeedRange;
 use verifier::Verifier;
 use vla::{DeviceName, Vla};
 
-/// A server must be seen within this time of its start.
-const SERVER_WAIT: Duration = Duration::from_secs(30);
+use super::episodes::FLEET_DEFAULT;
+use crate::files;
 
-/// Check everything that a run needs: Python, rendering, network, world, policy, verifier.
+/// A server must be found within this time of its start.
+const SERVER_WAIT: Duration = Duration::from_secs(30);
+/// The image size where there is no policy that asks for another.
+const IMAGE_SIZE_DEFAULT: (usize, usize) = (128, 128);
+
+/// Check everything that a run needs, and change nothing: Python, rendering, policy, verifier, servers.
 #[derive(Debug, Clone, Args)]
 pub struct Arguments {
     /// The checkpoint's folder [default: the one that comes with rever]
@@ -32,18 +36,18 @@ pub struct Arguments {
     #[arg(long)]
     verifier: Option<PathBuf>,
     /// Start a server of this simulator
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
     simulator: Simulator,
-    /// Check servers that run already instead of one started here
+    /// Check servers that are running instead of one started here
     #[arg(long, value_delimiter = ',')]
     connect: Vec<String>,
-    /// Only servers of the same fleet are looked for
-    #[arg(long, default_value = "local")]
+    /// Namespace: peers see each other only within the same fleet
+    #[arg(long, default_value = FLEET_DEFAULT)]
     fleet: String,
     /// A Python that has the packages of env-server, instead of the one that rever sets up
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the findings into this file, too
+    /// Also write the findings to this file
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
@@ -58,38 +62,44 @@ struct Finding {
 }
 
 /// Prints one line per check as it is done; an error when one fails.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let mut findings = Vec::new();
-    let site = Site {
-        servers: usize::from(arguments.connect.is_empty()),
-        simulator: arguments.simulator,
-        connect: arguments.connect.clone(),
-        fleet: arguments.fleet.clone(),
-        python: arguments.python.clone(),
-        ..Site::default()
+    let installation = files::installation_unchanged(host)?;
+    let folder = arguments.policy.unwrap_or_else(|| installation.policy_folder());
+    let source = ServerSource {
+        local: arguments.connect.is_empty().then_some(LocalSource {
+            count: 1,
+            simulator: arguments.simulator,
+            python: arguments.python,
+            installation,
+        }),
+        connect: arguments.connect,
+        listen: Vec::new(),
+        fleet: arguments.fleet,
     };
-    let mut python = None;
-    if site.servers > 0 {
-        python = check(&mut findings, "python", || check_python(&site));
-        if let Some(python) = &python {
-            check(&mut findings, "rendering", || check_rendering(python));
+    let mut program = None;
+    if let Some(local) = &source.local {
+        let python = check(&mut findings, "python", || check_python(local));
+        if let Some(python) = python {
+            check(&mut findings, "rendering", || check_rendering(&python));
+            program = check(&mut findings, "simulator", || check_simulator(local));
         }
     }
-    let folder = policy_folder(arguments.policy.as_ref())?;
     let policy = check(&mut findings, "policy", || check_policy(&folder));
     if let Some(policy) = &policy {
         let beside = folder.join("verifier.safetensors");
         let named = arguments.verifier.as_deref();
         if named.is_none() && !beside.is_file() {
-            println!("none  verifier   `rever collect` and `rever train` make one");
+            println!("none  verifier    `rever collect` and `rever train` make one");
         } else {
             let path = named.unwrap_or(&beside);
             check(&mut findings, "verifier", || check_verifier(path, policy));
         }
     }
-    if python.is_some() || !arguments.connect.is_empty() {
-        let size = policy.as_ref().map_or((128, 128), |policy| policy.info().image_size);
-        let image = check(&mut findings, "world", || check_world(&site, python, size));
+    if program.is_some() || source.local.is_none() {
+        let size = policy.as_ref().map_or(IMAGE_SIZE_DEFAULT, |policy| policy.info().image_size);
+        let image =
+            check(&mut findings, "environment", || check_environment(&source, program, size));
         if let (Some(policy), Some((image, instruction))) = (&policy, image) {
             check(&mut findings, "decision", || check_decision(policy, &image, &instruction));
         }
@@ -105,7 +115,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     Ok(())
 }
 
-/// Does one check and prints what came of it.
+/// Does one check and prints what it found.
 fn check<T>(
     findings: &mut Vec<Finding>,
     name: &'static str,
@@ -115,16 +125,17 @@ fn check<T>(
         Ok((found, text)) => (Some(found), Finding { name, is_ok: true, text }),
         Err(error) => (None, Finding { name, is_ok: false, text: format!("{error:#}") }),
     };
-    println!("{} {name:<10} {}", if finding.is_ok { "ok   " } else { "FAULT" }, finding.text);
+    println!("{} {name:<11} {}", if finding.is_ok { "ok   " } else { "FAULT" }, finding.text);
     findings.push(finding);
     found
 }
 
-fn check_python(site: &Site) -> Result<(PythonEnvironment, String)> {
-    let python = site.python_environment()?;
+fn check_python(local: &LocalSource) -> Result<(PythonEnvironment, String)> {
+    let python = local.python_environment(Missing::Report)?;
     let versions = "import sys, mujoco, numpy, zenoh; print('python', sys.version.split()[0], \
                     'mujoco', mujoco.__version__, 'numpy', numpy.__version__)";
-    let output = python.command().args(["-c", versions]).output().context("cannot start python")?;
+    let output = python.command().args(["-c", versions]).output();
+    let output = output.with_context(|| format!("cannot start {}", python.python.display()))?;
     ensure!(
         output.status.success(),
         "{} lacks a package: {}",
@@ -137,8 +148,14 @@ fn check_python(site: &Site) -> Result<(PythonEnvironment, String)> {
 }
 
 fn check_rendering(python: &PythonEnvironment) -> Result<((), String)> {
-    setup::software_gl(python)?;
-    Ok(((), "one frame rendered with software OpenGL (EGL)".to_owned()))
+    python.ensure_rendering(Missing::Report)?;
+    Ok(((), "one image rendered with software OpenGL (EGL)".to_owned()))
+}
+
+fn check_simulator(local: &LocalSource) -> Result<(ServerProgram, String)> {
+    let program = local.program(Missing::Report)?;
+    let text = format!("{}: {}", local.simulator, program.command().get_program().display());
+    Ok((program, text))
 }
 
 fn check_policy(folder: &Path) -> Result<(Vla, String)> {
@@ -160,25 +177,22 @@ fn check_verifier(path: &Path, policy: &Vla) -> Result<((), String)> {
     Ok(((), format!("{}: digest {}, fits the policy", path.display(), short(verifier.digest()))))
 }
 
-/// Opens the network on this machine, finds a server, resets a world and steps it once.
-fn check_world(
-    site: &Site,
-    python: Option<PythonEnvironment>,
+/// Opens the network, finds a server, resets an environment and steps it once.
+fn check_environment(
+    source: &ServerSource,
+    program: Option<ServerProgram>,
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-    let network = runtime.block_on(Network::open(site.network_options()))?;
-    let start = |python| -> Result<_> {
-        site.start(ServerProgram::prepare(site.simulator, python)?, &network, 1)
-    };
-    let local = python.map(start).transpose()?;
-    let result = runtime.block_on(try_world(&network, image_size));
+    let network = runtime.block_on(Network::open(source.network_options()))?;
+    let local = program.map(|program| source.start(program, &network, 1)).transpose()?;
+    let result = runtime.block_on(try_environment(&network, image_size));
     drop(local);
     runtime.block_on(network.close())?;
     result
 }
 
-async fn try_world(
+async fn try_environment(
     network: &Network,
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {

@@ -10,9 +10,7 @@ use evaluation::results::{Results, tasks_in_order};
 use evaluation::suite::{Layouts, Suite};
 use runtime::experiment::{self, Ending, Experiment, LoadScorer};
 use runtime::rollout::RecordOptions;
-use runtime::setup;
-use runtime::simulator::Simulator;
-use runtime::site::{Deployment, Site};
+use runtime::servers::{Deployment, Host, LocalSource, ServerSource, Simulator};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 use store::labels::LabelStore;
@@ -23,7 +21,7 @@ use verifier::Verifier;
 use vla::{DeviceName, Vla};
 
 use super::WrongUsage;
-use crate::build_info;
+use crate::{build_info, files};
 
 /// Processes on this machine unless others are named.
 const SERVERS_DEFAULT: u16 = 2;
@@ -145,14 +143,14 @@ impl Default for EpisodesArguments {
 
 impl EpisodesArguments {
     /// Runs what is not recorded yet, and computes the results of all that is.
-    pub fn run(&self, request: Request) -> Result<Outcome> {
-        let folder = policy_folder(self.policy.as_ref())?;
+    pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
+        let folder = files::policy_folder(self.policy.as_ref(), host)?;
         let policy = Vla::load(&folder, self.device)?;
         let digest = policy.parser().digest().to_owned();
         let verifier = self.verifier(&folder, &digest)?;
         self.check(&request, verifier.as_deref())?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let (tasks, deployment) = self.tasks(&runtime)?;
+        let (tasks, deployment) = self.tasks(&runtime, host)?;
         let suite = Suite {
             tasks,
             episodes: request.episodes,
@@ -177,7 +175,7 @@ impl EpisodesArguments {
         };
         let ending = experiment.run(run, &runtime, || match deployment {
             Some(deployment) => Ok(deployment),
-            None => self.site().open(&runtime, usize::from(self.sessions)),
+            None => self.servers(host)?.open(&runtime, usize::from(self.sessions)),
         })?;
         let (results, provenance) = results(&run_folder)?;
         Ok(Outcome { folder: run_folder, policy: folder, results, provenance, ending })
@@ -208,11 +206,11 @@ impl EpisodesArguments {
     }
 
     /// The tasks that were asked for; where none were, those that the servers offer, which must run for that.
-    fn tasks(&self, runtime: &Runtime) -> Result<(Vec<TaskId>, Option<Deployment>)> {
+    fn tasks(&self, runtime: &Runtime, host: &Host) -> Result<(Vec<TaskId>, Option<Deployment>)> {
         if !self.tasks.is_empty() {
             return Ok((self.tasks.clone(), None));
         }
-        let deployment = self.site().open(runtime, usize::from(self.sessions))?;
+        let deployment = self.servers(host)?.open(runtime, usize::from(self.sessions))?;
         let tasks = runtime.block_on(experiment::default_tasks(&deployment))?;
         Ok((tasks, Some(deployment)))
     }
@@ -252,17 +250,22 @@ impl EpisodesArguments {
         })
     }
 
-    /// Where the servers are.
-    fn site(&self) -> Site {
-        let started = self.servers.unwrap_or(SERVERS_DEFAULT);
-        Site {
-            servers: if self.connect.is_empty() { usize::from(started) } else { 0 },
-            simulator: self.simulator,
+    /// Where the servers come from.
+    fn servers(&self, host: &Host) -> Result<ServerSource> {
+        let start = || -> Result<LocalSource> {
+            Ok(LocalSource {
+                count: usize::from(self.servers.unwrap_or(SERVERS_DEFAULT)),
+                simulator: self.simulator,
+                python: self.python.clone(),
+                installation: files::installation(host)?,
+            })
+        };
+        Ok(ServerSource {
+            local: self.connect.is_empty().then(start).transpose()?,
             connect: self.connect.clone(),
             listen: self.listen.clone(),
             fleet: self.fleet.clone(),
-            python: self.python.clone(),
-        }
+        })
     }
 }
 
@@ -284,12 +287,4 @@ fn results(folder: &Path) -> Result<(Results, Value)> {
     provenance["versions"]["simulator"] = json!(simulator);
     let tasks = tasks_in_order(&header.options);
     Ok((Results::new(&summaries, &run::faults(folder)?, &tasks)?, provenance))
-}
-
-/// The named checkpoint, or the one that comes with the program.
-pub fn policy_folder(named: Option<&PathBuf>) -> Result<PathBuf> {
-    match named {
-        Some(folder) => Ok(folder.clone()),
-        None => Ok(setup::repository()?.join("agent/models/bridge-small")),
-    }
 }

@@ -8,6 +8,7 @@ use decision::{Setting, Strategy};
 use evaluation::result_file::ResultFile;
 use evaluation::suite::{LAYOUTS, Layouts};
 use evaluation::table;
+use runtime::servers::Host;
 use store::plan::SeedRange;
 
 use super::episodes::{EpisodesArguments, Outcome, Request};
@@ -38,7 +39,7 @@ pub struct Arguments {
 }
 
 /// Runs what is missing, then prints the tables.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let Arguments { strategies, temperature, candidates, .. } = &arguments;
     let request = Request {
         title: "evaluate",
@@ -47,7 +48,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
         range: SeedRange::Evaluation,
         settings: Setting::all(strategies, temperature, candidates),
     };
-    let outcome = arguments.episodes_arguments.run(request)?;
+    let outcome = arguments.episodes_arguments.run(host, request)?;
     show(&outcome, arguments.json.as_deref())
 }
 

@@ -15,10 +15,11 @@ use std::fmt;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
+use runtime::servers::Host;
 use tracing_subscriber::EnvFilter;
 
-/// Warnings only: progress and results have their own lines.
-const LOG_FILTER_DEFAULT: &str = "warn,zenoh=error,zenoh_transport=error,zenoh_link=error";
+/// Warnings only: progress and results have their own lines. What matters of zenoh's is returned as an error.
+const LOG_FILTER_DEFAULT: &str = "warn,zenoh=off";
 
 /// Evaluate reasoning robot policies: sample several candidates per step, verify them, execute the best one.
 #[derive(Debug, Parser)]
@@ -43,17 +44,17 @@ enum Command {
 
 impl Program {
     /// Runs the chosen subcommand to its end.
-    pub fn run(self) -> Result<()> {
+    pub fn run(self, host: &Host) -> Result<()> {
         match self.command {
-            Command::Demo(arguments) => demo::run(arguments),
-            Command::Evaluate(arguments) => evaluate::run(arguments),
-            Command::Collect(arguments) => collect::run(arguments),
-            Command::Train(arguments) => train::run(arguments),
-            Command::Report(arguments) => report::run(arguments),
+            Command::Demo(arguments) => demo::run(arguments, host),
+            Command::Evaluate(arguments) => evaluate::run(arguments, host),
+            Command::Collect(arguments) => collect::run(arguments, host),
+            Command::Train(arguments) => train::run(arguments, host),
+            Command::Report(arguments) => report::run(arguments, host),
             Command::Digest(arguments) => digest::run(arguments),
-            Command::Doctor(arguments) => doctor::run(arguments),
-            Command::Bench(arguments) => bench::run(arguments),
-            Command::Conformance(arguments) => conformance::run(arguments),
+            Command::Doctor(arguments) => doctor::run(arguments, host),
+            Command::Bench(arguments) => bench::run(arguments, host),
+            Command::Conformance(arguments) => conformance::run(arguments, host),
         }
     }
 }

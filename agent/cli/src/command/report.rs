@@ -6,8 +6,9 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::episodes::policy_folder;
+use crate::files::policy_folder;
 use evaluation::report::{self, Report, ReportOptions, Speech};
+use runtime::servers::Host;
 use store::run;
 use vla::CompletionParser;
 
@@ -35,9 +36,9 @@ pub struct Arguments {
 }
 
 /// Builds the report and says where it is.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let out = arguments.out.unwrap_or_else(|| arguments.run.join("report"));
-    let policy = policy_folder(arguments.policy.as_ref())?;
+    let policy = policy_folder(arguments.policy.as_ref(), host)?;
     let report = build(&arguments.run, &out, &policy, arguments.episodes_max)?;
     if let Some(path) = &arguments.json {
         let text = serde_json::to_string_pretty(&report)?;

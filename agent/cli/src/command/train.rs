@@ -7,6 +7,7 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use decision::ActionSpace;
 use evaluation::table::aligned;
+use runtime::servers::Host;
 use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
 use serde::Serialize;
 use store::record::write_whole;
@@ -17,7 +18,8 @@ use verifier::{
 };
 use vla::CompletionParser;
 
-use super::episodes::{FLEET_DEFAULT, policy_folder};
+use super::episodes::FLEET_DEFAULT;
+use crate::files::policy_folder;
 
 /// How long to look for agents that follow the verifier before it is published to nobody yet.
 const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
@@ -97,9 +99,9 @@ struct ResultFile<'a> {
 }
 
 /// Trains, prints, writes, publishes.
-pub fn run(arguments: Arguments) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let started = Instant::now();
-    let parser = CompletionParser::load(&policy_folder(arguments.policy.as_ref())?)?;
+    let parser = CompletionParser::load(&policy_folder(arguments.policy.as_ref(), host)?)?;
     let action_space = parser.action_space();
     let (episodes, excluded) = read(&arguments, &parser, &action_space)?;
     ensure!(

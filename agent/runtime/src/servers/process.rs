@@ -1,55 +1,77 @@
 //! One server process: its pipes are read, its last words kept, and it dies when this process does.
 
 use std::collections::VecDeque;
-use std::io::{BufRead, BufReader, Read, Result as IoResult};
-use std::os::unix::process::CommandExt;
-use std::process::{Child, Command, Stdio};
+use std::convert::Infallible;
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
 
 use anyhow::{Context, Result};
+use rustix::io::Errno;
+use rustix::process::{
+    Pid, Resource, Signal, WaitId, WaitIdOptions, getrlimit, kill_process_group, waitid,
+};
 
 /// How much of a server's last words an error repeats.
 const STDERR_LINES_MAX: usize = 20;
+/// A longer line is cut into several.
+const LINE_BYTES_MAX: u64 = 4096;
+/// A process that has ended has written all it will; one that it started may hold its pipes open for ever.
+const LAST_WORDS_WAIT: Duration = Duration::from_secs(1);
+/// What programs and libraries print when they get no memory.
+const MEMORY_WORDS: [&str; 5] = [
+    "MemoryError",
+    "bad_alloc",
+    "Cannot allocate memory",
+    "cannot allocate memory",
+    "memory allocation of",
+];
 
 pub(super) struct ServerProcess {
     child: Child,
     stderr: Arc<Mutex<VecDeque<String>>>,
+    is_killed: bool,
 }
 
 impl ServerProcess {
-    /// `on_line` receives every line of the standard output; then `on_closed` is called, once.
+    /// `on_line` receives every line of the standard output; then `on_ended` is called, once.
     /// The process is killed when the calling thread ends.
     pub(super) fn spawn(
         command: &mut Command,
         on_line: impl Fn(String) + Send + 'static,
-        on_closed: impl FnOnce() + Send + 'static,
+        on_ended: impl FnOnce() + Send + 'static,
     ) -> Result<ServerProcess> {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         // Ctrl-C in a terminal reaches the whole process group. The agent finishes its episodes on
         // it, and needs the servers for that.
         command.process_group(0);
         die_with_this_thread(command);
-        let mut child = command.spawn().with_context(|| format!("cannot start {command:?}"))?;
+        let program = command.get_program().to_owned();
+        let cannot = || format!("cannot start {}", program.display());
+        let mut child = command.spawn().with_context(cannot)?;
         let stdout = child.stdout.take().context("the standard output is piped")?;
         let stderr = child.stderr.take().context("the standard error is piped")?;
+        let id = pid(&child).with_context(cannot)?;
         let last_lines = Arc::new(Mutex::new(VecDeque::with_capacity(STDERR_LINES_MAX)));
         let kept = Arc::clone(&last_lines);
-        let words = std::thread::spawn(move || {
-            lines_of(stderr).for_each(|line| {
-                let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
-                if kept.len() == STDERR_LINES_MAX {
-                    kept.pop_front();
-                }
-                kept.push_back(line);
-            });
+        let (reading, all_read) = channel();
+        read_lines(stdout, reading.clone(), on_line);
+        read_lines(stderr, reading, move |line| {
+            let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
+            if kept.len() == STDERR_LINES_MAX {
+                kept.pop_front();
+            }
+            kept.push_back(line);
         });
-        std::thread::spawn(move || {
-            lines_of(stdout).for_each(on_line);
-            // Whoever handles the end wants to report the last words, so they come first.
-            let _ = words.join();
-            on_closed();
+        thread::spawn(move || {
+            wait_for_end(id, &all_read);
+            on_ended();
         });
-        Ok(ServerProcess { child, stderr: last_lines })
+        Ok(ServerProcess { child, stderr: last_lines, is_killed: false })
     }
 
     pub(super) fn id(&self) -> u32 {
@@ -61,39 +83,94 @@ impl ServerProcess {
         lines.iter().map(String::as_str).collect::<Vec<_>>().join("\n")
     }
 
-    /// Returns at once, before the process has ended.
+    /// Kills the process and those that it started. Returns at once: a process that waits for a device does not end before
+    /// the device answers.
     pub(super) fn kill(&mut self) {
-        // Only a process that has ended already cannot be killed.
-        let _ = self.child.kill();
+        self.is_killed = true;
+        if let Some(id) = pid(&self.child) {
+            // Only processes that have ended already cannot be killed.
+            let _ = kill_process_group(id, Signal::KILL);
+        }
     }
 
-    /// Kills the process unless it has ended by itself, and says in words how it ended.
+    /// Says how a process ended, after `on_ended` was called for it.
     pub(super) fn end(mut self) -> String {
+        let is_killed = self.is_killed;
+        // What it started must not outlive it. Its own number is not given to another process before it is waited for.
         self.kill();
+        let words = self.last_words();
         match self.child.wait() {
-            Ok(status) => format!("{status}\n{}", self.last_words()),
-            Err(error) => format!("unknown status ({error})\n{}", self.last_words()),
+            Ok(status) => {
+                let cause = if is_killed { None } else { memory_cause(status, &words) };
+                let cause = cause.map(|cause| format!(" ({cause})")).unwrap_or_default();
+                format!("{status}{cause}\n{words}").trim_end().to_owned()
+            }
+            Err(error) => format!("unknown status ({error})\n{words}"),
         }
     }
 }
 
-fn lines_of(stream: impl Read) -> impl Iterator<Item = String> {
-    BufReader::new(stream).lines().map_while(IoResult::ok)
+fn pid(child: &Child) -> Option<Pid> {
+    i32::try_from(child.id()).ok().and_then(Pid::from_raw)
+}
+
+/// Returns when the process has ended, without removing it from the system's table, and its last words are read.
+fn wait_for_end(id: Pid, all_read: &Receiver<Infallible>) {
+    let options = WaitIdOptions::EXITED | WaitIdOptions::NOWAIT;
+    while waitid(WaitId::Pid(id), options).is_err_and(|error| error == Errno::INTR) {}
+    // The channel closes when both pipes are read to their ends.
+    let _ = all_read.recv_timeout(LAST_WORDS_WAIT);
+}
+
+/// Reads to the end of the stream, without control characters: the lines go to a terminal.
+fn read_lines(
+    stream: impl Read + Send + 'static,
+    reading: Sender<Infallible>,
+    on_line: impl Fn(String) + Send + 'static,
+) {
+    thread::spawn(move || {
+        let mut stream = BufReader::new(stream);
+        let mut line = Vec::new();
+        loop {
+            line.clear();
+            match stream.by_ref().take(LINE_BYTES_MAX).read_until(b'\n', &mut line) {
+                Ok(0) | Err(_) => break,
+                Ok(_) => {
+                    let text = String::from_utf8_lossy(line.trim_ascii_end());
+                    on_line(text.chars().filter(|character| !character.is_control()).collect());
+                }
+            }
+        }
+        drop(reading);
+    });
+}
+
+/// Why a process that nobody here killed may have had too little memory.
+fn memory_cause(status: ExitStatus, words: &str) -> Option<String> {
+    let limit = getrlimit(Resource::As).current;
+    let limited = limit.map(|bytes| {
+        format!("each process may use {} MB of memory here, see `ulimit -v`", bytes / 1_000_000)
+    });
+    if MEMORY_WORDS.iter().any(|cry| words.contains(cry)) {
+        return Some(limited.unwrap_or_else(|| "out of memory".to_owned()));
+    }
+    if status.signal() == Some(Signal::KILL.as_raw()) {
+        return Some("killed from outside, perhaps for lack of memory, see `dmesg`".to_owned());
+    }
+    // With too little for its libraries a process fails in many ways.
+    limited.filter(|_| !status.success())
 }
 
 /// Lets the kernel kill the child when the calling thread ends, however it ends.
 #[cfg(target_os = "linux")]
 fn die_with_this_thread(command: &mut Command) {
-    let parent = std::process::id();
+    use rustix::process::{getpid, getppid, set_parent_process_death_signal};
+
+    let parent = getpid();
     let request = move || {
-        // SAFETY: plain system calls, allowed between fork and exec; they touch no memory.
-        let (refused, parent_now) =
-            unsafe { (libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL) != 0, libc::getppid()) };
-        if refused {
-            return Err(std::io::Error::last_os_error());
-        }
+        set_parent_process_death_signal(Some(Signal::KILL))?;
         // A parent that died before the request above would never send the signal.
-        if u32::try_from(parent_now) == Ok(parent) {
+        if getppid() == Some(parent) {
             Ok(())
         } else {
             Err(std::io::ErrorKind::NotConnected.into())

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{anyhow, ensure};
-use protocol::{Description, Heartbeat, Keys, Message, decode};
+use protocol::{Description, Heartbeat, Keys, Message, decode, transport};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
@@ -74,14 +74,14 @@ impl Discovery {
             .callback(move |sample| watched.on_token(&names, &sample))
             .background()
             .await
-            .map_err(|error| anyhow!("cannot watch for servers: {error}"))?;
+            .map_err(|error| anyhow!("cannot watch for servers: {}", transport::in_words(error)))?;
         let (watched, names) = (Arc::clone(&discovery), keys.clone());
         session
             .declare_subscriber(keys.heartbeats())
             .callback(move |sample| watched.on_heartbeat(&names, &sample))
             .background()
             .await
-            .map_err(|error| anyhow!("cannot watch heartbeats: {error}"))?;
+            .map_err(|error| anyhow!("cannot watch heartbeats: {}", transport::in_words(error)))?;
         let asked = Arc::clone(&discovery);
         tokio::spawn(asked.ask_new_servers(session.clone(), keys.clone()));
         Ok(discovery)
@@ -262,11 +262,10 @@ pub(super) async fn describe(
     keys: Keys,
     server: String,
 ) -> anyhow::Result<Description> {
-    let replies = session
-        .get(keys.describe(&server)?)
-        .timeout(DESCRIBE_TIMEOUT)
-        .await
-        .map_err(|error| anyhow!("cannot be asked for its description: {error}"))?;
+    let replies =
+        session.get(keys.describe(&server)?).timeout(DESCRIBE_TIMEOUT).await.map_err(|error| {
+            anyhow!("cannot be asked for its description: {}", transport::in_words(error))
+        })?;
     let secs = DESCRIBE_TIMEOUT.as_secs();
     let silent = || anyhow!("did not describe itself within {secs} s");
     let reply = replies.recv_async().await.map_err(|_| silent())?;

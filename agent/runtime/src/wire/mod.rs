@@ -7,6 +7,7 @@
 mod discovery;
 mod environment;
 mod episode;
+mod local_endpoint;
 mod network;
 mod outcomes;
 mod pool;
@@ -16,7 +17,7 @@ mod verifier_updates;
 pub use discovery::Fleet;
 pub use environment::Environment;
 pub use episode::Episode;
-pub use network::{Network, NetworkOptions, Timing};
+pub use network::{Network, NetworkOptions, Timing, check_endpoint};
 pub use outcomes::OutcomePublisher;
 pub use pool::{PoolOptions, ZenohPool};
 pub use probe::Probe;

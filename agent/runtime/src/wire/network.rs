@@ -1,21 +1,17 @@
 //! One zenoh session: what it connects to, where it listens, and the servers that it sees.
 
 use std::net::{Ipv4Addr, TcpListener};
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, ensure};
 use protocol::{Keys, transport};
 use tempfile::TempDir;
 use zenoh::Session;
 
 use super::discovery::{Discovery, Fleet};
+use super::local_endpoint::{ANY_LOOPBACK_PORT, local_endpoint};
 
-/// Stands for a free port of this machine alone.
-const ANY_LOOPBACK_PORT: &str = "tcp/127.0.0.1:0";
-/// Of a socket in the file system; a system's own limit is 104 or 108 with the name that zenoh adds for a lock.
-const SOCKET_PATH_BYTES_MAX: usize = 96;
 /// Another process may take a port between its choice and its use.
 const PORT_ATTEMPTS_MAX: usize = 10;
 /// A client waits this long for the router or server that it is told to connect to.
@@ -100,7 +96,13 @@ impl Network {
     /// Opens the session. Needs a tokio runtime with several threads.
     pub async fn open(options: NetworkOptions) -> anyhow::Result<Self> {
         let keys = Keys::new(&options.fleet)?;
-        let here = options.listen_here.then(|| here(&tempfile::env::temp_dir())).transpose()?;
+        options
+            .connect
+            .iter()
+            .chain(&options.listen)
+            .try_for_each(|place| check_endpoint(place))?;
+        let here = options.listen_here.then(|| local_endpoint(&tempfile::env::temp_dir()));
+        let here = here.transpose()?;
         let (here, folder) = here.unzip();
         let listen: Vec<String> = here.into_iter().chain(options.listen.clone()).collect();
         let (session, listening) = open_session(&options, &listen).await?;
@@ -136,6 +138,11 @@ impl Network {
         fleet.borrow().clone()
     }
 
+    /// When a server's simulation last moved, if it was ever heard of.
+    pub fn last_beat(&self, server: &str) -> Option<std::time::Instant> {
+        self.discovery.status(server).borrow().beaten_at.map(tokio::time::Instant::into_std)
+    }
+
     /// Whether servers are reached over a link of their own, which may fail without them.
     pub(super) fn is_remote(&self) -> bool {
         self.is_remote
@@ -149,32 +156,24 @@ impl Network {
 
     /// Ends the session; peers that watch this agent's tokens see it at once.
     pub async fn close(self) -> anyhow::Result<()> {
-        self.session.close().await.map_err(|error| anyhow!("cannot close the network: {error}"))
+        self.session
+            .close()
+            .await
+            .map_err(|error| anyhow!("cannot close the network: {}", transport::in_words(error)))
     }
 }
 
-/// An endpoint of this machine alone, and the folder that it lies in.
-#[cfg(unix)]
-fn here(parent: &Path) -> anyhow::Result<(String, Option<TempDir>)> {
-    use std::fs::Permissions;
-    use std::os::unix::fs::PermissionsExt;
-
-    let mut folder = tempfile::Builder::new();
-    folder.prefix("rever-").permissions(Permissions::from_mode(0o700));
-    let folder = folder.tempdir_in(parent).context("no temporary folder for a socket")?;
-    let socket = folder.path().join("zenoh");
-    // What begins an endpoint's parameters cannot stand in its address.
-    let fits = |path: &&str| path.len() <= SOCKET_PATH_BYTES_MAX && !path.contains(['?', '#', ';']);
-    Ok(match socket.to_str().filter(fits) {
-        Some(path) => (format!("unixsock-stream/{path}"), Some(folder)),
-        None => (ANY_LOOPBACK_PORT.to_owned(), None),
-    })
-}
-
-/// An endpoint of this machine alone.
-#[cfg(not(unix))]
-fn here(_parent: &Path) -> anyhow::Result<(String, Option<TempDir>)> {
-    Ok((ANY_LOOPBACK_PORT.to_owned(), None))
+/// An error for an endpoint that this program has no transport for; zenoh would try it for as long as it may.
+pub fn check_endpoint(endpoint: &str) -> anyhow::Result<()> {
+    let is_known = match endpoint.split_once('/') {
+        Some(("tcp", address)) => address
+            .rsplit_once(':')
+            .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok()),
+        Some(("unixsock-stream", path)) => !path.is_empty(),
+        _ => false,
+    };
+    ensure!(is_known, "endpoint {endpoint}: expected tcp/HOST:PORT or unixsock-stream/PATH");
+    Ok(())
 }
 
 async fn open_session(
@@ -188,7 +187,11 @@ async fn open_session(
         match zenoh::open(configuration).await {
             Ok(session) => return Ok((session, listening)),
             Err(error) if listening == listen || attempt == PORT_ATTEMPTS_MAX => {
-                return Err(anyhow!("cannot open the network listening on {listening:?}: {error}"));
+                let reason = transport::in_words(error);
+                return Err(match &options.connect[..] {
+                    [] => anyhow!("cannot listen on {}: {reason}", listening.join(", ")),
+                    connect => anyhow!("cannot connect to {}: {reason}", connect.join(", ")),
+                });
             }
             Err(_) => attempt += 1,
         }
@@ -211,40 +214,30 @@ fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Resu
     let NetworkOptions { connect, multicast, .. } = options;
     let mut configuration = zenoh::Config::default();
     for (key, value) in transport::settings(connect, listening, *multicast, CLIENT_WAIT_MS) {
-        configuration
-            .insert_json5(key, &value)
-            .map_err(|error| anyhow!("zenoh does not take {key} = {value}: {error}"))?;
+        configuration.insert_json5(key, &value).map_err(|error| {
+            anyhow!("zenoh does not take {key} = {value}: {}", transport::in_words(error))
+        })?;
     }
     Ok(configuration)
 }
 
-#[cfg(all(test, unix))]
+#[cfg(test)]
 mod tests {
-    use std::os::unix::fs::PermissionsExt;
-
     use super::*;
 
-    #[tokio::test(flavor = "multi_thread")]
-    async fn the_socket_is_this_users_alone_and_goes_with_the_network() -> anyhow::Result<()> {
-        let network = Network::open(NetworkOptions::default()).await?;
-        let endpoint = network.listening()[0].clone();
-        let socket = Path::new(endpoint.strip_prefix("unixsock-stream/").context("no socket")?);
-        let folder = socket.parent().context("no folder")?;
-        assert!(socket.exists());
-        assert_eq!(folder.metadata()?.permissions().mode() & 0o777, 0o700);
-        network.close().await?;
-        assert!(!folder.exists());
-        Ok(())
-    }
-
     #[test]
-    fn a_folder_with_too_long_a_name_for_a_socket_gives_a_port() -> anyhow::Result<()> {
-        let folder = tempfile::tempdir()?;
-        let deep = folder.path().join("d".repeat(SOCKET_PATH_BYTES_MAX));
-        std::fs::create_dir(&deep)?;
-        assert_eq!(here(&deep)?.0, ANY_LOOPBACK_PORT);
-        assert!(here(folder.path())?.0.starts_with("unixsock-stream/"));
-        assert_eq!(deep.read_dir()?.count(), 0);
-        Ok(())
+    fn endpoints_without_a_transport_are_refused() {
+        for known in ["tcp/localhost:7447", "tcp/[::1]:0", "unixsock-stream//tmp/socket"] {
+            assert!(check_endpoint(known).is_ok(), "{known}");
+        }
+        for unknown in
+            ["", "localhost:7447", "tcp/localhost", "tcp/:1", "tcp/a:99999", "tls/a:1", "udp/a:1"]
+        {
+            let error = check_endpoint(unknown).expect_err("no transport").to_string();
+            assert!(
+                error.starts_with(&format!("endpoint {unknown}: expected tcp/HOST:PORT")),
+                "{error}"
+            );
+        }
     }
 }

@@ -3,7 +3,7 @@
 //! The record and its label are written before an outcome is published, and nothing waits for anybody to read it.
 
 use anyhow::anyhow;
-use protocol::{EpisodeOutcome, encode};
+use protocol::{EpisodeOutcome, encode, transport};
 use zenoh::Wait;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;
@@ -24,13 +24,18 @@ impl OutcomePublisher {
             .declare_publisher(network.keys.outcome(run)?)
             .congestion_control(CongestionControl::Drop)
             .await
-            .map_err(|error| anyhow!("cannot publish the outcomes of run {run}: {error}"))?;
+            .map_err(|error| {
+                anyhow!("cannot publish the outcomes of run {run}: {}", transport::in_words(error))
+            })?;
         Ok(Self { publisher })
     }
 
     /// Publishes one outcome; an observer that is slow may miss it.
     pub fn publish(&self, outcome: &EpisodeOutcome) -> anyhow::Result<()> {
         let bytes = encode(outcome)?;
-        self.publisher.put(bytes).wait().map_err(|error| anyhow!("cannot publish: {error}"))
+        self.publisher
+            .put(bytes)
+            .wait()
+            .map_err(|error| anyhow!("cannot publish: {}", transport::in_words(error)))
     }
 }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
-use protocol::{Description, Heartbeat, Open, Opening, decode, encode};
+use protocol::{Description, Heartbeat, Open, Opening, decode, encode, transport};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, timeout, timeout_at};
 use zenoh::liveliness::LivelinessToken;
@@ -34,7 +34,9 @@ impl Probe {
             .await
             .map_err(in_words)?;
         let reply = replies.recv_async().await.map_err(|_| anyhow!("no answer to Open"))?;
-        let sample = reply.into_result().map_err(|error| anyhow!("answered {error}"))?;
+        let sample = reply
+            .into_result()
+            .map_err(|error| anyhow!("answered {}", transport::in_words(error)))?;
         Ok(decode(&sample.payload().to_bytes())?)
     }
 
@@ -118,5 +120,5 @@ impl Network {
 }
 
 fn in_words(error: zenoh::Error) -> anyhow::Error {
-    anyhow!("zenoh: {error}")
+    anyhow!("zenoh: {}", transport::in_words(error))
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::anyhow;
-use protocol::{VerifierUpdate, decode, encode};
+use protocol::{VerifierUpdate, decode, encode, transport};
 use sha2::{Digest, Sha256};
 use tokio::sync::watch;
 use zenoh::qos::{CongestionControl, Reliability};
@@ -41,13 +41,21 @@ impl VerifierPublisher {
             .cache(CacheConfig::default().max_samples(1))
             .publisher_detection()
             .await
-            .map_err(|error| anyhow!("cannot publish verifier {name}: {error}"))?;
+            .map_err(|error| {
+                anyhow!("cannot publish verifier {name}: {}", transport::in_words(error))
+            })?;
         Ok(Self { name: name.to_owned(), publisher })
     }
 
     /// Waits until at least one agent follows this verifier, or until `wait` is over; whether one does.
     pub async fn wait_for_follower(&self, wait: Duration) -> anyhow::Result<bool> {
-        let failed = |error| anyhow!("cannot watch who follows verifier {}: {error}", self.name);
+        let failed = |error| {
+            anyhow!(
+                "cannot watch who follows verifier {}: {}",
+                self.name,
+                transport::in_words(error)
+            )
+        };
         // The listener comes first: who arrives between the two is seen by one of them.
         let listener = self.publisher.matching_listener().await.map_err(failed)?;
         if self.publisher.matching_status().await.map_err(failed)?.matching() {
@@ -74,10 +82,9 @@ impl VerifierPublisher {
             weights: weights.into(),
         };
         let bytes = encode(&update)?;
-        self.publisher
-            .put(bytes)
-            .await
-            .map_err(|error| anyhow!("cannot publish verifier {}: {error}", self.name))
+        self.publisher.put(bytes).await.map_err(|error| {
+            anyhow!("cannot publish verifier {}: {}", self.name, transport::in_words(error))
+        })
     }
 }
 
@@ -91,7 +98,9 @@ impl VerifierSubscriber {
             .callback(move |sample| receive(&sender, &sample))
             .history(HistoryConfig::default().max_samples(1).detect_late_publishers())
             .await
-            .map_err(|error| anyhow!("cannot subscribe to verifier {name}: {error}"))?;
+            .map_err(|error| {
+                anyhow!("cannot subscribe to verifier {name}: {}", transport::in_words(error))
+            })?;
         Ok(Self { latest, _subscriber: subscriber })
     }
 

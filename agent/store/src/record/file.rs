@@ -205,7 +205,8 @@ mod tests {
             assert!(matches!(error, ReadError::Damaged { .. }), "{length} bytes: {error}");
         }
         let error = decode(&[&bytes[..], &[0]].concat()).expect_err("one byte more");
-        let expected = "a.msgpack: damaged: expected one record and nothing else; rerun the command";
+        let expected =
+            "a.msgpack: damaged: expected one record and nothing else; rerun the command";
         assert!(error.to_string().starts_with(expected), "{error}");
     }
 

@@ -49,7 +49,9 @@ pub fn summaries(folder: &Path) -> Result<Vec<EpisodeSummary>> {
             // Its writer has set it aside meanwhile.
             Err(ReadError::Unreadable { source, .. })
                 if source.kind() == std::io::ErrorKind::NotFound => {}
-            Err(error @ ReadError::Damaged { .. }) => tracing::warn!("a record is not counted: {error}"),
+            Err(error @ ReadError::Damaged { .. }) => {
+                tracing::warn!("a record is not counted: {error}")
+            }
             Err(error) => return Err(error.into()),
         }
     }

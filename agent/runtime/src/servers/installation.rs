@@ -1,0 +1,254 @@
+//! Where the program's own files are: in a checkout, or embedded in the program and unpacked.
+//!
+//! Both have the same layout, `env-server/` and `agent/models/`, so that nothing else needs to know which it is.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use flate2::read::GzDecoder;
+use tempfile::TempDir;
+
+/// Present in every checkout and in every unpacked copy.
+const LANDMARKS: [&str; 2] =
+    ["env-server/rever_env/__main__.py", "agent/models/bridge-small/config.json"];
+/// As much of a digest as tells builds apart.
+const DIGEST_CHARACTERS: usize = 12;
+
+/// What `main` reads of the process's surroundings, once.
+#[derive(Debug, Clone, Default)]
+pub struct Host {
+    /// The file that this program was started from.
+    pub program: Option<PathBuf>,
+    /// The current folder.
+    pub folder: Option<PathBuf>,
+    /// The environment variables.
+    pub variables: BTreeMap<OsString, OsString>,
+}
+
+/// Files embedded in a program.
+#[derive(Debug, Clone, Copy)]
+pub struct Bundle {
+    /// A compressed archive (`.tar.gz`) in the layout of a checkout.
+    pub archive: &'static [u8],
+    /// Of the archive, in hexadecimal.
+    pub digest: &'static str,
+}
+
+/// What to do about something that is missing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Missing {
+    /// Install it.
+    Install,
+    /// Report it as an error, and change nothing on this machine.
+    Report,
+}
+
+/// The program's own files.
+#[derive(Debug, Clone)]
+pub struct Installation {
+    /// The folder that holds `env-server` and `agent/models`.
+    pub root: PathBuf,
+    /// What is there of the surroundings.
+    pub host: Host,
+    /// Where Python environments are kept, unless this is a checkout.
+    home: Option<PathBuf>,
+    /// Holds files that were unpacked for this process alone; goes with the last clone.
+    temporary: Option<Arc<TempDir>>,
+}
+
+impl Installation {
+    /// The checkout that holds the program or the current folder; without one, the embedded files. They are unpacked into
+    /// the data folder when they are first needed, or into a temporary one if nothing may be changed.
+    pub fn find(host: &Host, bundle: &Bundle, missing: Missing) -> Result<Installation> {
+        let places = [host.program.as_deref(), host.folder.as_deref()];
+        let mut folders = places.into_iter().flatten().flat_map(Path::ancestors);
+        if let Some(root) = folders.find(|folder| is_complete(folder)) {
+            return Ok(Installation::checkout(root, host));
+        }
+        let home = home(&host.variables)
+            .context("no folder for rever's files: set REVER_HOME or HOME to an absolute path")?;
+        let root = home.join(bundle.digest.get(..DIGEST_CHARACTERS).unwrap_or(bundle.digest));
+        let mut found =
+            Installation { root, host: host.clone(), home: Some(home), temporary: None };
+        if !is_complete(&found.root) {
+            match missing {
+                Missing::Install => unpack_once(bundle, &found.root)?,
+                Missing::Report => {
+                    let folder = Arc::new(temporary_folder()?);
+                    unpack(bundle, folder.path())?;
+                    found.root = folder.path().to_owned();
+                    found.temporary = Some(folder);
+                }
+            }
+        }
+        Ok(found)
+    }
+
+    /// A folder that is known to be a checkout.
+    pub fn checkout(root: &Path, host: &Host) -> Installation {
+        Installation { root: root.to_owned(), host: host.clone(), home: None, temporary: None }
+    }
+
+    /// The checkpoint that comes with rever.
+    pub fn policy_folder(&self) -> PathBuf {
+        self.root.join("agent/models/bridge-small")
+    }
+
+    /// The folder that holds the Python package `rever_env` and the lists of packages that it needs.
+    pub fn package_root(&self) -> PathBuf {
+        self.root.join("env-server")
+    }
+
+    /// Whether programs can be built here.
+    pub fn is_checkout(&self) -> bool {
+        self.home.is_none()
+    }
+
+    /// Whether the files go when this process ends.
+    pub fn is_temporary(&self) -> bool {
+        self.temporary.is_some()
+    }
+
+    /// The folder of a Python environment: in a checkout `.venv/NAME`, elsewhere one for every list of packages, which
+    /// builds with the same list share.
+    pub(super) fn environment_folder(&self, name: &str, packages_digest: &str) -> PathBuf {
+        let digest = packages_digest.get(..DIGEST_CHARACTERS).unwrap_or(packages_digest);
+        match &self.home {
+            None => self.root.join(".venv").join(name),
+            Some(home) => home.join("python").join(digest),
+        }
+    }
+}
+
+fn is_complete(folder: &Path) -> bool {
+    LANDMARKS.iter().all(|file| folder.join(file).is_file())
+}
+
+/// Follows the XDG base directory specification; a relative path there is to be ignored.
+fn home(variables: &BTreeMap<OsString, OsString>) -> Option<PathBuf> {
+    let folder = |name: &str| {
+        let path = variables.get(std::ffi::OsStr::new(name)).map(PathBuf::from);
+        path.filter(|path| path.is_absolute())
+    };
+    folder("REVER_HOME")
+        .or_else(|| folder("XDG_DATA_HOME").map(|data| data.join("rever")))
+        .or_else(|| folder("HOME").map(|home| home.join(".local/share/rever")))
+}
+
+/// Unpacks beside `root` first, so that a folder of this name is whole whenever it is seen.
+fn unpack_once(bundle: &Bundle, root: &Path) -> Result<()> {
+    let parent = root.parent().context("a folder in the data folder has a parent")?;
+    let cannot = || format!("cannot unpack rever's files into {}", root.display());
+    std::fs::create_dir_all(parent).with_context(cannot)?;
+    let folder =
+        tempfile::Builder::new().prefix(".unpacking-").tempdir_in(parent).with_context(cannot)?;
+    unpack(bundle, folder.path())?;
+    match std::fs::rename(folder.path(), root) {
+        // Another process was faster, with the same files.
+        Err(_) if is_complete(root) => Ok(()),
+        renamed => renamed.with_context(cannot),
+    }
+}
+
+fn unpack(bundle: &Bundle, folder: &Path) -> Result<()> {
+    let mut archive = tar::Archive::new(GzDecoder::new(bundle.archive));
+    archive.set_preserve_mtime(false);
+    archive
+        .unpack(folder)
+        .with_context(|| format!("cannot unpack rever's files into {}", folder.display()))
+}
+
+fn temporary_folder() -> Result<TempDir> {
+    tempfile::Builder::new().prefix("rever-files-").tempdir().context("no temporary folder")
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use flate2::{Compression, write::GzEncoder};
+
+    use super::*;
+
+    /// An archive with the landmarks alone.
+    fn bundle() -> Bundle {
+        let mut archive = tar::Builder::new(GzEncoder::new(Vec::new(), Compression::fast()));
+        for name in LANDMARKS {
+            let mut header = tar::Header::new_gnu();
+            header.set_size(1);
+            header.set_mode(0o644);
+            archive.append_data(&mut header, name, &b"x"[..]).unwrap();
+        }
+        let mut encoder = archive.into_inner().unwrap();
+        encoder.flush().unwrap();
+        let archive = encoder.finish().unwrap().leak();
+        Bundle { archive, digest: "0123456789abcdef" }
+    }
+
+    fn host(folder: &Path) -> Host {
+        let home = folder.join("home");
+        Host {
+            program: Some(folder.join("bin/rever")),
+            folder: Some(folder.join("work")),
+            variables: BTreeMap::from([("HOME".into(), home.into())]),
+        }
+    }
+
+    #[test]
+    fn embedded_files_are_unpacked_once_into_the_data_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let host = host(folder.path());
+        let found = Installation::find(&host, &bundle(), Missing::Install).unwrap();
+        assert_eq!(found.root, folder.path().join("home/.local/share/rever/0123456789ab"));
+        assert!(is_complete(&found.root) && !found.is_checkout() && !found.is_temporary());
+        let mine = found.root.join("mine");
+        std::fs::write(&mine, "").unwrap();
+        let again = Installation::find(&host, &bundle(), Missing::Install).unwrap();
+        assert_eq!(again.root, found.root);
+        assert!(mine.exists());
+        let data = found.root.parent().unwrap();
+        assert_eq!(data.read_dir().unwrap().count(), 1, "nothing half unpacked is left");
+    }
+
+    #[test]
+    fn nothing_is_left_where_nothing_may_be_changed() {
+        let folder = tempfile::tempdir().unwrap();
+        let found = Installation::find(&host(folder.path()), &bundle(), Missing::Report).unwrap();
+        assert!(is_complete(&found.root) && found.is_temporary());
+        let root = found.root.clone();
+        drop(found);
+        assert!(!root.exists());
+        assert_eq!(folder.path().read_dir().unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_checkout_around_the_program_or_the_current_folder_is_used() {
+        let folder = tempfile::tempdir().unwrap();
+        for place in ["bin", "work"] {
+            let checkout = folder.path().join(place);
+            unpack(&bundle(), &checkout).unwrap();
+            let found =
+                Installation::find(&host(folder.path()), &bundle(), Missing::Install).unwrap();
+            assert_eq!(found.root, checkout);
+            assert!(found.is_checkout());
+            std::fs::remove_dir_all(checkout).unwrap();
+        }
+        assert_eq!(folder.path().read_dir().unwrap().count(), 0);
+    }
+
+    #[test]
+    fn the_data_folder_follows_the_users_variables() {
+        let check = |variables: &[(&str, &str)], expected: Option<&str>| {
+            let variables = variables.iter().map(|(name, value)| (name.into(), value.into()));
+            assert_eq!(home(&variables.collect()), expected.map(PathBuf::from));
+        };
+        check(&[], None);
+        check(&[("HOME", "/a")], Some("/a/.local/share/rever"));
+        check(&[("HOME", "/a"), ("XDG_DATA_HOME", "/b")], Some("/b/rever"));
+        check(&[("HOME", "/a"), ("XDG_DATA_HOME", "b")], Some("/a/.local/share/rever"));
+        check(&[("HOME", "/a"), ("REVER_HOME", "/c")], Some("/c"));
+    }
+}

@@ -1,0 +1,77 @@
+//! The simulators whose servers can be started on this machine.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fmt;
+use std::path::PathBuf;
+use std::process::Command;
+
+use clap::ValueEnum;
+use serde::Serialize;
+
+use super::python::PythonEnvironment;
+
+/// One of ours. `Python` and `Native` give the same bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Simulator {
+    /// `python -m rever_env serve`.
+    #[default]
+    Python,
+    /// `rever-simulator`, built when it is first asked for.
+    Native,
+    /// The Bridge tasks in robosuite, with its controllers; it has packages of its own.
+    Robosuite,
+}
+
+impl fmt::Display for Simulator {
+    /// As the command line has it.
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let value = self.to_possible_value();
+        formatter.write_str(value.as_ref().map_or("", |value| value.get_name()))
+    }
+}
+
+/// A program that serves environments, ready to be started.
+#[derive(Debug, Clone)]
+pub enum ServerProgram {
+    /// The package `rever_env`.
+    Python(PythonEnvironment),
+    /// The same, with the Bridge tasks in robosuite.
+    Robosuite(PythonEnvironment),
+    /// The program `rever-simulator`.
+    Native {
+        /// The program.
+        program: PathBuf,
+        /// Scenes and tasks.toml.
+        assets: PathBuf,
+        /// All variables that it sees.
+        variables: BTreeMap<OsString, OsString>,
+    },
+}
+
+impl ServerProgram {
+    /// What its `serve` needs to be told beside the common options.
+    pub fn serve_arguments(&self) -> &'static [&'static str] {
+        match self {
+            ServerProgram::Robosuite(_) => &["--robosuite", "bridge"],
+            ServerProgram::Python(_) | ServerProgram::Native { .. } => &[],
+        }
+    }
+
+    /// The program without its subcommand.
+    pub fn command(&self) -> Command {
+        match self {
+            ServerProgram::Python(environment) | ServerProgram::Robosuite(environment) => {
+                let mut command = environment.command();
+                command.args(["-m", "rever_env"]);
+                command
+            }
+            ServerProgram::Native { program, assets, variables } => {
+                let mut command = Command::new(program);
+                command.env_clear().envs(variables).arg("--assets").arg(assets);
+                command
+            }
+        }
+    }
+}

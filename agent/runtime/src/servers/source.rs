@@ -1,0 +1,136 @@
+//! Where a run's servers come from: processes that are started on this machine, or endpoints.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use tokio::runtime::Runtime;
+
+use super::installation::{Installation, Missing};
+use super::local::{LocalServerOptions, LocalServers};
+use super::native;
+use super::program::{ServerProgram, Simulator};
+use super::python::{
+    PythonEnvironment, named_environment, servers_environment, simulators_environment,
+};
+use crate::wire::{Network, NetworkOptions};
+
+/// A server may need nearly as long to open a session. One with episodes is found to be frozen much earlier, by the
+/// requests that it does not answer.
+const SILENCE_MAX: Duration = Duration::from_secs(60);
+
+/// Where a run's servers come from.
+#[derive(Debug, Clone)]
+pub struct ServerSource {
+    /// Processes to start here; none when `connect` names others.
+    pub local: Option<LocalSource>,
+    /// Endpoints of a router or of servers that are running.
+    pub connect: Vec<String>,
+    /// Endpoints that others may connect to, such as a trainer. Servers that are started here have one of their own.
+    pub listen: Vec<String>,
+    /// Peers see each other only within the same fleet.
+    pub fleet: String,
+}
+
+/// Servers to be started on this machine.
+#[derive(Debug, Clone)]
+pub struct LocalSource {
+    /// How many processes.
+    pub count: usize,
+    /// What they are.
+    pub simulator: Simulator,
+    /// A Python that has the packages already, instead of the one that rever sets up.
+    pub python: Option<PathBuf>,
+    /// The program's own files.
+    pub installation: Installation,
+}
+
+/// An open network, and the servers that were started for it.
+pub struct Deployment {
+    /// What was asked for.
+    pub source: ServerSource,
+    /// The way to all servers.
+    pub network: Network,
+    /// Those of this machine.
+    pub local: Option<Arc<LocalServers>>,
+}
+
+impl Deployment {
+    /// Ends the local servers, then the network. Blocks.
+    pub fn close(self, runtime: &Runtime) -> Result<()> {
+        // Servers first: they would report the network's end as an error.
+        drop(self.local);
+        runtime.block_on(self.network.close())
+    }
+}
+
+impl ServerSource {
+    /// Opens the network and starts the local servers if there are any, each for up to `sessions` sessions. Blocks; what the
+    /// servers need is installed first, which may take minutes.
+    pub fn open(&self, runtime: &Runtime, sessions: usize) -> Result<Deployment> {
+        let local = self.local.as_ref();
+        let program = local.map(|local| local.program(Missing::Install)).transpose()?;
+        let network = runtime.block_on(Network::open(self.network_options()))?;
+        let local = program.map(|program| self.start(program, &network, sessions)).transpose()?;
+        Ok(Deployment { source: self.clone(), network, local: local.map(Arc::new) })
+    }
+
+    /// How many servers are started here.
+    pub fn local_count(&self) -> usize {
+        self.local.as_ref().map_or(0, |local| local.count)
+    }
+
+    /// Local servers connect to this agent; to reach others nothing needs to listen here.
+    pub fn network_options(&self) -> NetworkOptions {
+        NetworkOptions {
+            connect: self.connect.clone(),
+            listen_here: self.local.is_some(),
+            listen: self.listen.clone(),
+            fleet: self.fleet.clone(),
+            ..NetworkOptions::default()
+        }
+    }
+
+    /// Starts the local servers and waits until they are ready. Blocks.
+    pub fn start(
+        &self,
+        program: ServerProgram,
+        network: &Network,
+        sessions: usize,
+    ) -> Result<LocalServers> {
+        let options = LocalServerOptions {
+            count: self.local_count(),
+            connect: network.listening().first().context("the network listens nowhere")?.clone(),
+            fleet: self.fleet.clone(),
+            // Each could serve all of them, should the others die.
+            sessions_each: sessions,
+            silence_max: SILENCE_MAX,
+        };
+        let network = network.clone();
+        LocalServers::start(program, &options, move |server| network.last_beat(server))
+    }
+}
+
+impl LocalSource {
+    /// What the servers are started with; installing it takes a minute or two.
+    pub fn program(&self, missing: Missing) -> Result<ServerProgram> {
+        let python = self.python_environment(missing)?;
+        Ok(match self.simulator {
+            Simulator::Python => ServerProgram::Python(python),
+            Simulator::Robosuite => ServerProgram::Robosuite(python),
+            Simulator::Native => native::prepare(&self.installation, &python, missing)?,
+        })
+    }
+
+    /// The Python that the servers run on, or whose MuJoCo they use.
+    pub fn python_environment(&self, missing: Missing) -> Result<PythonEnvironment> {
+        match (&self.python, self.simulator) {
+            (Some(python), _) => Ok(named_environment(&self.installation, python, missing)),
+            (None, Simulator::Robosuite) => simulators_environment(&self.installation, missing),
+            (None, Simulator::Python | Simulator::Native) => {
+                servers_environment(&self.installation, missing)
+            }
+        }
+    }
+}
