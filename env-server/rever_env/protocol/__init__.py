@@ -24,7 +24,6 @@ from rever_env.protocol.reply import (
     Saved,
     Stepped,
     Transition,
-    stepped_in_layout,
 )
 from rever_env.protocol.request import (
     Close,
@@ -33,7 +32,6 @@ from rever_env.protocol.request import (
     Restore,
     Save,
     Step,
-    step_in_layout,
 )
 from rever_env.protocol.statistics import Statistics
 from rever_env.protocol.value import recognise_protocol
@@ -83,7 +81,6 @@ __all__ = [
     "TooLarge",
     "Transition",
     "VerifierUpdate",
-    "stepped_in_layout",
 ]
 
 DESCRIPTION: Codec[Description] = Codec(
@@ -97,7 +94,6 @@ REQUEST: Codec[Request] = Codec(
     "request",
     limits.REQUEST_BYTES_MAX,
     {kind.__name__: kind for kind in (Reset, Step, Save, Restore, Close)},
-    in_layout=step_in_layout,
 )
 REPLY: Codec[Reply] = Codec(
     "reply",

@@ -1,5 +1,6 @@
 //! Checks of single values, worded once for every message.
 
+use crate::codec::first_value;
 use crate::limits::{ELEMENTS_MAX, NAME_BYTES_MAX, TEXT_BYTES_MAX};
 use crate::{PROTOCOL_VERSION, limits};
 
@@ -94,8 +95,8 @@ pub fn recognise_protocol(bytes: &[u8]) -> Result<(), String> {
     struct Versioned {
         protocol: u32,
     }
-    match rmp_serde::from_slice::<Versioned>(bytes) {
-        Ok(versioned) => protocol(versioned.protocol),
+    match first_value::<Versioned>(bytes) {
+        Ok((versioned, _)) => protocol(versioned.protocol),
         // Not even a version: the strict decoder has better words for it.
         Err(_) => Ok(()),
     }
