@@ -14,3 +14,5 @@ mod readme;
 mod refused;
 /// Pictures as the tiles that changed.
 mod tiles;
+/// What zenoh's errors say once the places in its source are taken out.
+mod transport;

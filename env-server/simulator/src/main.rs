@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! serving     the network, and how it ends       trace     every number of an episode, to be compared
-//!   server    leases, queue, heartbeat           session   numbered requests, slots
+//!   server    leases, heartbeat                  session   numbered requests, slots
+//!     inbox, outbox       what waits for the simulation thread, and what it sends
 //!   worlds    idle worlds                        world     one task in MuJoCo: reset, step, save, restore
 //!     mjcf, model, controller, success, expert, layout, camera    tasks   assets/tasks.toml
 //! ```
@@ -11,9 +12,11 @@ mod camera;
 mod controller;
 mod expert;
 mod fault;
+mod inbox;
 mod layout;
 mod mjcf;
 mod model;
+mod outbox;
 mod server;
 mod serving;
 mod session;
@@ -28,7 +31,6 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
-use protocol::transport::{RUNTIME_POOL, RUNTIME_SINGLE, RUNTIME_VARIABLE};
 
 /// The world of rever_env, natively.
 #[derive(Parser)]
@@ -48,15 +50,12 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    // What an agent has set for itself comes down to the servers that it starts, and is no user's choice.
-    let defaults = [
-        (RUNTIME_VARIABLE, RUNTIME_SINGLE, RUNTIME_POOL),
-        (camera::DRAWING_THREADS.0, camera::DRAWING_THREADS.1, camera::DRAWING_THREADS.1),
-    ];
-    for (name, value, inherited) in defaults {
-        if std::env::var_os(name).is_none_or(|chosen| chosen == inherited) {
-            // SAFETY: no other thread runs yet that could read the environment.
-            unsafe { std::env::set_var(name, value) };
+    // SAFETY: no other thread runs yet that could read the environment.
+    unsafe {
+        // Images must not depend on the graphics card that this machine may have.
+        std::env::set_var("LIBGL_ALWAYS_SOFTWARE", "1");
+        if std::env::var_os(camera::DRAWING_THREADS.0).is_none() {
+            std::env::set_var(camera::DRAWING_THREADS.0, camera::DRAWING_THREADS.1);
         }
     }
     let program = Program::parse();

@@ -196,8 +196,9 @@ impl Supervisor {
     }
 
     fn on_line(&mut self, slot: usize, line: &str) {
-        let Some(server_id) = line.strip_prefix("ready ") else { return };
-        self.slots[slot].server_id = Some(server_id.trim().to_owned());
+        let Some(offer) = line.strip_prefix("ready ") else { return };
+        let Some(server_id) = offer.split_whitespace().next() else { return };
+        self.slots[slot].server_id = Some(server_id.to_owned());
         self.slots[slot].ready_at = Some(Instant::now());
         if self.slots.iter().all(|slot| slot.server_id.is_some())
             && let Some(ready) = self.ready.take()
