@@ -256,7 +256,6 @@ def test_keys_lie_under_version_and_fleet() -> None:
     assert keys.heartbeat("s1") == "rever/3/home/server/s1/heartbeat"
     assert keys.session("a") == "rever/3/home/session/a"
     assert keys.request("a") == "rever/3/home/session/a/request"
-    assert keys.requests("s1") == "rever/3/home/session/s1.$*/request"
     assert keys.reply("a") == "rever/3/home/session/a/reply"
     assert keys.outcome("run.1") == "rever/3/home/outcome/run.1"
     assert keys.verifier("best_of-2") == "rever/3/home/verifier/best_of-2"

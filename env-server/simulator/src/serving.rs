@@ -1,6 +1,6 @@
 //! The serve subcommand: its arguments, the network it opens, and how it ends.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
@@ -21,6 +21,7 @@ use crate::worlds::Worlds;
 const PARENT_POLL: Duration = Duration::from_millis(500);
 /// A wedged simulation is given up after that.
 const FINISH_WAIT_MAX: Duration = Duration::from_secs(10);
+const CLOSE_WAIT_MAX: Duration = Duration::from_secs(3);
 /// A client waits this long for the router or agent that it is told to connect to.
 const CLIENT_WAIT_MS: u32 = 30_000;
 
@@ -71,6 +72,14 @@ pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
         [] => tasks,
         names => tasks::choose(tasks, names)?,
     };
+    if let Some(path) = &arguments.id_file {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        ensure!(
+            folder.is_none_or(Path::is_dir),
+            "--id-file {}: expected it in a folder that exists",
+            path.display()
+        );
+    }
     let stop = Arc::new(AtomicBool::new(false));
     stop_on_signals(Arc::clone(&stop))?;
     let network = zenoh::open(configuration(&arguments.ways)?).wait().map_err(|error| {
@@ -103,10 +112,23 @@ pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
         FINISH_WAIT_MAX.as_secs()
     );
     thread.join().map_err(|_| anyhow!("the simulation thread panicked"))?;
-    network.close().wait().map_err(|error| {
-        anyhow!("cannot close the network: {}", transport::cause(&error.to_string()))
-    })?;
+    close(network)?;
     result.unwrap_or(Ok(()))
+}
+
+/// Leaves the rest to the end of the process where zenoh waits for a peer that reads nothing.
+fn close(network: zenoh::Session) -> Result<()> {
+    let (done, closed) = mpsc::channel();
+    thread::Builder::new().name("closing".to_owned()).spawn(move || {
+        // Nobody listens any more once that took too long.
+        let _ = done.send(network.close().wait());
+    })?;
+    match closed.recv_timeout(CLOSE_WAIT_MAX) {
+        Ok(result) => result.map_err(|error| {
+            anyhow!("cannot close the network: {}", transport::cause(&error.to_string()))
+        }),
+        Err(_) => Ok(()),
+    }
 }
 
 /// A name that may stand in keys.
