@@ -265,3 +265,7 @@ def test_keys_lie_under_version_and_fleet() -> None:
 def test_a_name_with_wildcards_or_slashes_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match="cannot stand in a key"):
         Keys(name)
+
+
+def test_a_peers_text_is_harmless_in_a_terminal() -> None:
+    assert protocol.printable("gone\x1b[31m\r\n\x9b2J é") == "gone\ufffd[31m\ufffd\ufffd\ufffd2J é"

@@ -218,6 +218,12 @@ fn number_cases() -> Vec<Case> {
             nothing,
             "request is invalid: variant: expected 1 to 128 bytes, got 0",
         ),
+        case(
+            "control_character",
+            "request",
+            changed(reset(), b"\xa7default", b"\xa7def\x1b[2J"),
+            "request is invalid: variant: expected no control characters, got U+001B",
+        ),
     ]
 }
 

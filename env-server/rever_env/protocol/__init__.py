@@ -34,7 +34,7 @@ from rever_env.protocol.request import (
     Step,
 )
 from rever_env.protocol.statistics import Statistics
-from rever_env.protocol.value import recognise_protocol
+from rever_env.protocol.value import printable, recognise_protocol
 from rever_env.protocol.verifier_update import VerifierUpdate
 
 __all__ = [
@@ -81,6 +81,7 @@ __all__ = [
     "TooLarge",
     "Transition",
     "VerifierUpdate",
+    "printable",
 ]
 
 DESCRIPTION: Codec[Description] = Codec(

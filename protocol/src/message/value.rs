@@ -4,10 +4,13 @@ use crate::codec::first_value;
 use crate::limits::{ELEMENTS_MAX, NAME_BYTES_MAX, TEXT_BYTES_MAX};
 use crate::{PROTOCOL_VERSION, limits};
 
-/// A name: not empty, not long.
+/// A name: not empty, not long, and harmless in a terminal.
 pub fn name(field: &str, value: &str) -> Result<(), String> {
     if value.is_empty() || value.len() > NAME_BYTES_MAX {
         return Err(format!("{field}: expected 1 to {NAME_BYTES_MAX} bytes, got {}", value.len()));
+    }
+    if let Some(letter) = value.chars().find(|letter| letter.is_control()) {
+        return Err(format!("{field}: expected no control characters, got U+{:04X}", letter as u32));
     }
     Ok(())
 }
