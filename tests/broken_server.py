@@ -152,16 +152,14 @@ def other_size() -> None:
 def overstates_time() -> None:
     @wrap(Session, "_stepped")
     def stepped(original: Any, self: Any, *arguments: Any) -> Any:
-        answer: Any = protocol.REPLY.decode(original(self, *arguments))
-        return protocol.REPLY.encode(
-            replace(answer, simulator_us=answer.simulator_us * 1000)
-        )
+        answer = original(self, *arguments)
+        return replace(answer, simulator_us=answer.simulator_us * 1000)
 
 
 def forgets_tile() -> None:
     @wrap(Session, "_stepped")
     def stepped(original: Any, self: Any, *arguments: Any) -> Any:
-        answer: Any = protocol.REPLY.decode(original(self, *arguments))
+        answer = original(self, *arguments)
         if answer.changed_tiles:
             observation = answer.transition.observation
             pixels = observation.image.pixels[: -3 * protocol.limits.TILE_SIDE**2]
@@ -171,7 +169,7 @@ def forgets_tile() -> None:
             transition = replace(answer.transition, observation=observation)
             tiles = answer.changed_tiles[:-1]
             answer = replace(answer, transition=transition, changed_tiles=tiles)
-        return protocol.REPLY.encode(answer)
+        return answer
 
 
 def any_length() -> None:

@@ -54,7 +54,9 @@ impl Server {
         let stdout = child.stdout.take().expect("its standard output is piped");
         let mut line = String::new();
         BufReader::new(stdout).read_line(&mut line).expect("its standard output is text");
-        let id = line.strip_prefix("ready ").map(|id| id.trim_end().to_owned());
+        let mut words = line.split_whitespace();
+        let id = words.next().filter(|word| *word == "ready").and_then(|_| words.next());
+        let id = id.map(str::to_owned);
         let id =
             id.unwrap_or_else(|| panic!("expected a line `ready` of the server, got {line:?}"));
         Self { child, id, endpoint: endpoint.to_owned() }

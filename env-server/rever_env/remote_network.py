@@ -3,7 +3,6 @@
 import contextlib
 import ctypes
 import os
-import re
 import time
 import weakref
 from collections.abc import Callable, Iterable, Sequence
@@ -13,7 +12,7 @@ from typing import Any
 import zenoh
 
 from rever_env import endpoint, protocol
-from rever_env.serving import Endpoints
+from rever_env.serving import Endpoints, cause
 from rever_env.tasks import TaskId
 
 _LOOK_SECS = 0.2  # between looks for a server
@@ -22,7 +21,6 @@ _NOBODY_SECS = 5.0  # how long no server may be found over a connection
 _WAIT_SECS = 30.0  # for a server that is there to be free, or to answer
 _REACH_SECS = 5.0  # for one connection
 _RETURN_SECS = 2.0  # from a new connection to the server's token
-_SOURCE = re.compile(r"\s+at \S+\.rs:\d+\.?")  # where zenoh was built tells users nothing
 
 
 class RemoteFault(RuntimeError):
@@ -110,7 +108,7 @@ class Network:
         except zenoh.ZError as error:
             raise RemoteFault(
                 f"no zenoh server or router answered at {self.place} within {wait:g} s: "
-                f"{_SOURCE.sub('', str(error))}"
+                f"{cause(error)}"
             ) from None
         self._is_routed = bool(self.zenoh.info.routers_zid())
         self._declared: list[Any] = []

@@ -90,11 +90,12 @@ class RemoteSession:
         if isinstance(reply, protocol.Refused):
             self._is_unanswered = False
             if reply.sequence == 0:  # every request of ours can be read: it is the session's end
-                raise self._lost(f"refused: {reply.reason}")
-            raise RemoteRefused(reply.reason)
+                raise self._lost(f"refused: {protocol.printable(reply.reason)}")
+            raise RemoteRefused(protocol.printable(reply.reason))
         if isinstance(reply, protocol.Faulted):
             self._is_unanswered = False
-            raise RemoteFault(f"{self._server}: {reply.kind.value}: {reply.reason}")
+            reason = protocol.printable(reply.reason)
+            raise RemoteFault(f"{self._server}: {reply.kind.value}: {reason}")
         whole = self._whole(reply)
         self._is_unanswered = False
         return whole
@@ -189,7 +190,7 @@ class RemoteSession:
             raise RemoteFault(f"{self._server} did not answer Open within {_OPEN_SECS:g} s")
         opening = self._read(protocol.OPENING, answers[0].ok.payload.to_bytes())
         if isinstance(opening, protocol.OpenRefused):
-            raise RemoteRefused(opening.reason)
+            raise RemoteRefused(protocol.printable(opening.reason))
         name = opening.session
         self._network.watch(self.server, lambda: self._replies.put(None))
         self._network.declare(
@@ -238,7 +239,7 @@ class RemoteSession:
                 return
             reply = None if data is None else self._read(protocol.REPLY, data)
             if reply is not None and reply.sequence == 0 and isinstance(reply, protocol.Refused):
-                raise self._lost(f"refused: {reply.reason}")
+                raise self._lost(f"refused: {protocol.printable(reply.reason)}")
             if reply is not None and reply.sequence > self._sequence:
                 raise self._lost(
                     f"sent reply {reply.sequence} before its request: expected at most "

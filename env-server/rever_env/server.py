@@ -1,15 +1,11 @@
 """Sessions over zenoh, all stepped by one thread: the one that owns the rendering contexts.
 
-It waits for requests in zenoh's own channel: request -> inbox -> simulation thread -> session ->
-reply. All else that it has to do waits in a queue, and a message to the inbox says so: waking it by
-Python's locks would cost each request another switch of threads.
+callback -> inbox -> simulation thread -> session -> outbox: neither zenoh's threads nor the
+simulation thread wait for a peer.
 """
 
-import collections
-import contextlib
 import logging
 import os
-import queue
 import secrets
 import sys
 import threading
@@ -24,6 +20,8 @@ import zenoh
 
 from rever_env import protocol
 from rever_env.fault import Fault
+from rever_env.inbox import Inbox
+from rever_env.outbox import Answers, Outbox
 from rever_env.protocol import limits
 from rever_env.session import Session, refused
 from rever_env.worlds import UnknownTask, Worlds
@@ -33,16 +31,14 @@ _log = logging.getLogger(__name__)
 _BEAT_SECS = 0.5
 _HOLDER_SECS_MAX = 10.0  # from opening a session to its holder's token
 _CLOSED_SECS_MAX = 10.0  # a closed session still answers: its last reply may have been lost
-_PENDING_PER_SESSION_MAX = 4  # requests in the inbox; the holder resends what is dropped
-_TICK, _WORK = "tick", "work"  # messages of our own to the inbox
 
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """fleet: who meets whom.
+    """fleet: peers see each other only within the same one.
 
     whole_images: a step's image is not compared with the last one to send what changed only. Where
-    nothing leaves the machine comparing takes longer than it spares.
+    nothing leaves the machine, comparing takes longer than it saves.
     """
 
     fleet: str = "local"
@@ -56,11 +52,10 @@ class _Lease:
 
     name: str
     session: Session
-    publisher: Any
-    key: zenoh.KeyExpr
-    declared: list[Any]
+    outbox: Outbox
     opened_at: float
-    used_at: float
+    declared: list[Any]
+    closed_at: float | None = None
     holder: Literal["awaited", "alive", "gone"] = "awaited"
 
     def on_token(self, sample: Any) -> None:
@@ -87,29 +82,17 @@ class Server:
         self._worlds = worlds
         self._options = options
         self._keys = protocol.Keys(options.fleet)
-        self._leases: dict[str, _Lease] = {}  # by the key of its requests
-        self._tick_key = self._keys.request(self._named(_TICK))
+        self._leases: dict[str, _Lease] = {}
         self._ended_steps = 0
-        self._pending_max = (options.sessions_max + 1) * _PENDING_PER_SESSION_MAX
-        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._ticks: collections.deque[float] = collections.deque(maxlen=self._pending_max)
-        self._waking = threading.Lock()
-        self._ended = False  # set under _waking: zenoh refuses to be closed while a thread puts
+        self._inbox = Inbox()
+        self._answers = Answers()
         self._description()  # worlds that cannot be described are refused now
 
     def run(self, stop: threading.Event, ready: Callable[[str], None]) -> None:
         """Declares everything, the liveliness token last; then works until stop is set."""
-        inbox = self._network.declare_subscriber(
-            self._keys.requests(self.id), zenoh.handlers.RingChannel(self._pending_max)
-        )
         declared: list[Any] = [
-            inbox,
-            self._network.declare_queryable(
-                self._keys.describe(self.id), _direct(self._enqueuing(self._describe))
-            ),
-            self._network.declare_queryable(
-                self._keys.open(self.id), _direct(self._enqueuing(self._open))
-            ),
+            self._queryable(self._keys.describe(self.id), self._describe),
+            self._queryable(self._keys.open(self.id), self._open),
         ]
         heartbeat = self._network.declare_publisher(
             self._keys.heartbeat(self.id),
@@ -118,76 +101,40 @@ class Server:
         )
         declared.append(heartbeat)
         declared.append(self._network.liveliness().declare_token(self._keys.server(self.id)))
-        ready(self.id)
-        threading.Thread(target=self._tick, args=(stop,), name="clock", daemon=True).start()
         try:
-            self._loop(stop, inbox, heartbeat)
+            ready(self.id)
+            self._loop(stop, heartbeat)
         finally:
-            with self._waking:
-                self._ended = True
             for declaration in reversed(declared):
                 declaration.undeclare()
-            for key in list(self._leases):
-                self._end(key, None)
+            for lease in list(self._leases.values()):
+                self._end(lease, None)
+            self._answers.close()
             self._worlds.close()
 
-    def _loop(self, stop: threading.Event, inbox: Any, heartbeat: Any) -> None:
+    def _loop(self, stop: threading.Event, heartbeat: Any) -> None:
         beat_at = time.monotonic()
         while not stop.is_set():
-            sample = inbox.recv()
-            key = str(sample.key_expr)
-            lease = self._leases.get(key)
-            if lease is not None:
-                self._answer(lease, sample.payload)
-                continue
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    self._work.get_nowait()()
-            if key == self._tick_key and self._ticks:
-                self._end_abandoned(self._ticks.popleft())
-                if time.monotonic() >= beat_at:
-                    heartbeat.put(protocol.HEARTBEAT.encode(self._heartbeat()))
-                    beat_at = time.monotonic() + _BEAT_SECS / 2
+            now = time.monotonic()
+            if now >= beat_at:
+                heartbeat.put(protocol.HEARTBEAT.encode(self._heartbeat()))
+                self._end_abandoned(now)
+                beat_at = now + _BEAT_SECS
+            work = self._inbox.take(beat_at)
+            if work is not None:
+                work()
 
-    def _tick(self, stop: threading.Event) -> None:
-        """Tells the simulation thread that time passes, and at once when stop is set."""
-        stopped = False
-        while not stopped:
-            stopped = stop.wait(_BEAT_SECS)
-            if self._ended:
-                return
-            self._ticks.append(time.monotonic())
-            self._wake(_TICK)
+    def _queryable(self, key: str, answer: Callable[[Any], bytes]) -> Any:
+        """Leaves the queries on key to the simulation thread and drops what is too much."""
 
-    def _wake(self, kind: str) -> None:
-        """Puts a message of our own behind the requests in the inbox."""
-        with self._waking, contextlib.suppress(zenoh.ZError):  # a closed network: nobody waits
-            if not self._ended:
-                self._network.put(
-                    self._keys.request(self._named(kind)),
-                    b"",
-                    allowed_destination=zenoh.Locality.SESSION_LOCAL,
-                )
+        def on_query(query: Any) -> None:
+            if not self._inbox.put_query(lambda: self._answers.send(query, key, answer(query))):
+                self._answers.discard(query)
 
-    def _named(self, name: str) -> str:
-        """What the inbox takes for one of this server's sessions."""
-        return f"{self.id}.{name}"
+        return self._network.declare_queryable(key, _direct(on_query))
 
-    def _enqueuing(self, act: Callable[[Any], None]) -> Callable[[Any], None]:
-        """A callback that leaves act to the simulation thread and drops what is too much."""
-
-        def callback(event: Any) -> None:
-            if self._work.qsize() < self._pending_max:
-                self._work.put(lambda: act(event))
-                self._wake(_WORK)
-            else:
-                _log.warning("more is asked than %d waiting requests", self._pending_max)
-
-        return callback
-
-    def _describe(self, query: Any) -> None:
-        with query:
-            query.reply(self._keys.describe(self.id), self._description())
+    def _describe(self, _query: Any) -> bytes:
+        return self._description()
 
     def _description(self) -> bytes:
         description = protocol.Description(
@@ -216,7 +163,7 @@ class Server:
         )
         return protocol.DESCRIPTION.encode(description)
 
-    def _open(self, query: Any) -> None:
+    def _open(self, query: Any) -> bytes:
         answer: protocol.Opened | protocol.OpenRefused
         try:
             size = 0 if query.payload is None else len(query.payload)
@@ -227,69 +174,73 @@ class Server:
             answer = protocol.Opened(self._lease(opened))
         except (ValueError, UnknownTask, Fault) as error:
             answer = protocol.OpenRefused(str(error)[:200])
-        with query:
-            query.reply(self._keys.open(self.id), protocol.OPENING.encode(answer))
+        return protocol.OPENING.encode(answer)
 
     def _lease(self, opened: protocol.Open) -> str:
         """A new session; everything that hears its requests stands when this returns."""
         session = Session(opened, self._worlds, whole_images=self._options.whole_images)
-        name = self._named(secrets.token_hex(8))
+        name = secrets.token_hex(8)
         publisher = self._network.declare_publisher(
             self._keys.reply(name),
             congestion_control=zenoh.CongestionControl.BLOCK,
             reliability=zenoh.Reliability.RELIABLE,
             express=True,
         )
-        # zenoh knows the key by a number then, and need not match each request with the inbox.
-        key = self._network.declare_keyexpr(self._keys.request(name))
-        now = time.monotonic()
-        lease = _Lease(name, session, publisher, key, [publisher], opened_at=now, used_at=now)
-        self._leases[str(key)] = lease
-        look = self._enqueuing(lambda _: self._end_gone())
+        lease = _Lease(name, session, Outbox(publisher), time.monotonic(), [])
+        self._leases[name] = lease
 
         def on_token(sample: Any) -> None:
             lease.on_token(sample)
             if lease.holder == "gone":
-                look(sample)  # at once, or with the next tick if the queue is full
+                self._inbox.put_urgent(self._end_gone)
 
-        lease.declared.append(
+        lease.declared = [
+            self._network.declare_subscriber(
+                self._keys.request(name),
+                _direct(self._inbox.session(lambda request: self._answer(lease, request))),
+            ),
             self._network.liveliness().declare_subscriber(
                 self._keys.session(name), _direct(on_token), history=True
-            )
-        )
+            ),
+        ]
         _log.info("session %s opened for %s", name, opened.holder)
         return name
 
-    def _answer(self, lease: _Lease, payload: zenoh.ZBytes) -> None:
-        reply = lease.session.answer(payload.to_bytes())
+    def _answer(self, lease: _Lease, request: bytes | protocol.TooLarge) -> None:
+        if lease.name not in self._leases:
+            return
+        if isinstance(request, protocol.TooLarge):
+            reply: bytes | None = refused(0, str(request))
+        else:
+            reply = lease.session.answer(request)
+        if lease.session.closed and lease.closed_at is None:
+            lease.closed_at = time.monotonic()
         if reply is not None:
-            lease.publisher.put(reply)
-        # However long that took, its holder was not the silent one.
-        lease.used_at = time.monotonic()
+            lease.outbox.send(reply)
 
     def _end_gone(self) -> None:
-        for key, lease in list(self._leases.items()):
+        for lease in list(self._leases.values()):
             if lease.holder == "gone":
-                self._end(key, "its holder is gone")
+                self._end(lease, None if lease.session.closed else "its holder is gone")
 
-    def _end_abandoned(self, as_of: float) -> None:
-        """Ends what nobody used until then; what came later may still wait in the inbox."""
+    def _end_abandoned(self, now: float) -> None:
         self._end_gone()
-        for key, lease in list(self._leases.items()):
-            if lease.session.closed and as_of - lease.used_at > _CLOSED_SECS_MAX:
-                self._end(key, None)
-            elif lease.holder == "awaited" and as_of - lease.opened_at > _HOLDER_SECS_MAX:
-                self._end(key, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
+        for lease in list(self._leases.values()):
+            if lease.closed_at is not None:
+                if now - lease.closed_at > _CLOSED_SECS_MAX:
+                    self._end(lease, None)
+            elif lease.holder == "awaited" and now - lease.opened_at > _HOLDER_SECS_MAX:
+                self._end(lease, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
 
-    def _end(self, key: str, reason: str | None) -> None:
-        lease = self._leases.pop(key)
+    def _end(self, lease: _Lease, reason: str | None) -> None:
+        del self._leases[lease.name]
         self._ended_steps += lease.session.steps
         if reason is not None:
             _log.info("session %s ended: %s", lease.name, reason)
-            lease.publisher.put(refused(0, f"session {lease.name} ended: {reason}"))
+            lease.outbox.send(refused(0, f"session {lease.name} ended: {reason}"))
+        lease.outbox.close()
         for declaration in reversed(lease.declared):
             declaration.undeclare()
-        self._network.undeclare(lease.key)
         lease.session.end()
 
     def _heartbeat(self) -> protocol.Heartbeat:

@@ -1,6 +1,5 @@
 """One leased session: its numbered requests, its world, its saved states."""
 
-import dataclasses
 import logging
 import time
 from typing import Any
@@ -75,8 +74,7 @@ class Session:
     def _perform(self, request: protocol.Request) -> bytes:
         sequence = request.sequence
         try:
-            reply = self._reply(request)
-            return reply if isinstance(reply, bytes) else protocol.REPLY.encode(reply)
+            return protocol.REPLY.encode(self._reply(request))
         except (_Wrong, UnknownTask, world.InvalidAction, world.InvalidReset) as error:
             return refused(sequence, str(error))
         except world.PhysicsDiverged as error:
@@ -90,8 +88,7 @@ class Session:
                 sequence, protocol.FaultKind.INTERNAL, f"{type(error).__name__}: {error}"
             )
 
-    def _reply(self, request: protocol.Request) -> protocol.Reply | bytes:
-        """The reply, of a step its bytes."""
+    def _reply(self, request: protocol.Request) -> protocol.Reply:
         if self.closed:
             raise _Wrong(f"expected nothing after Close, got {type(request).__name__}")
         if isinstance(request, protocol.Reset):
@@ -164,41 +161,38 @@ class Session:
     def _key_of(self, task: str, variant: str) -> Key:
         return task, variant, self._opened.image_height, self._opened.image_width
 
-    def _stepped(self, sequence: int, transition: world.Transition, simulator_us: int) -> bytes:
+    def _stepped(
+        self, sequence: int, transition: world.Transition, simulator_us: int
+    ) -> protocol.Stepped:
         image = transition.observation.image
         changes = None if self._whole_images else tiles.changes(self._last_image, image)
         self._last_image = image
-        changed_tiles, pixels = changes or (None, image.reshape(-1).data)
-        observation = self._observation(transition.observation, b"")
-        judged = (
-            transition.statistics,
-            transition.reward,
-            transition.terminated,
-            transition.truncated,
+        changed_tiles, pixels = changes or (None, image.tobytes())
+        return protocol.Stepped(
+            sequence,
+            protocol.Transition(
+                self._observation(transition.observation, pixels),
+                transition.statistics,
+                transition.reward,
+                transition.terminated,
+                transition.truncated,
+            ),
+            changed_tiles,
+            simulator_us,
         )
-        data = protocol.stepped_in_layout(
-            sequence, observation, pixels, judged, changed_tiles, simulator_us
-        )
-        if data is None:
-            seen = dataclasses.replace(observation.image, pixels=bytes(pixels))
-            observation = dataclasses.replace(observation, image=seen)
-            stepped = protocol.Transition(observation, *judged)
-            message = protocol.Stepped(sequence, stepped, changed_tiles, simulator_us)
-            data = protocol.REPLY.encode(message)
-        return data
 
     def _observation(
         self, observation: world.Observation, pixels: bytes | None = None
     ) -> protocol.Observation:
         """pixels: in place of the whole image's."""
-        image = observation.image
+        height, width, _ = observation.image.shape
         expert_action = None
         if self._opened.expert and self._world is not None:
             action = self._world.expert_action().astype(np.float32)
             expert_action = tuple(action.tolist())
         return protocol.Observation(
             image=protocol.Image(
-                image.shape[0], image.shape[1], image.tobytes() if pixels is None else pixels
+                height, width, observation.image.tobytes() if pixels is None else pixels
             ),
             state=tuple(observation.state.tolist()),
             instruction=observation.instruction,

@@ -1,5 +1,6 @@
 """The command line says in one line what is wrong."""
 
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -29,7 +30,12 @@ def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
         ),
         ("demonstrate --episodes 1 --out x --tasks cup", 1, "error: task cup: expected one of"),
         (
-            "serve --listen tcp/127.0.0.1:0 --control-hz 5",
+            "serve --listen tcp/127.0.0.1:9 --id-file /nowhere/id",
+            2,
+            "error: --id-file /nowhere/id: expected it in a folder that exists",
+        ),
+        (
+            "serve --listen tcp/127.0.0.1:9 --control-hz 5",
             2,
             "error: --control-hz has no effect without tasks of robosuite's own",
         ),
@@ -48,6 +54,10 @@ def test_an_error_is_one_line(arguments: str, status: int, words: str) -> None:
         ("demonstrate --episodes 0 --out x", "--episodes: expected a whole number from 1, got 0"),
         ("expert --processes -1", "--processes: expected a whole number from 1, got -1"),
         ("serve --arguments notjson", "--arguments: expected a JSON object, got notjson"),
+        ("serve --listen 127.0.0.1", "endpoint '127.0.0.1': expected tcp/HOST:PORT or HOST:PORT"),
+        ("serve --listen tcp/127.0.0.1:99999", "expected tcp/HOST:PORT or HOST:PORT"),
+        ("serve --listen tcp/127.0.0.1:9 --fleet ../x", "cannot stand in a key"),
+        ("serve --listen tcp/127.0.0.1:9 --sessions 0", "--sessions: expected 1 to 256, got 0"),
         ("", "the following arguments are required: COMMAND"),
     ],
 )
@@ -63,3 +73,14 @@ def test_a_folder_that_is_a_file_is_said(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith(f"error: cannot use {tmp_path}/taken/"), done.stderr
     assert "Not a directory" in done.stderr
+
+
+def test_a_port_that_is_in_use_is_named_without_the_paths_of_a_build() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        endpoint = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+        done = run("serve", "--listen", endpoint)
+    assert done.returncode == 1
+    error = done.stderr.splitlines()[-1]
+    assert error.startswith("error: cannot open the network: ")
+    assert endpoint in error and "Address already in use" in error
+    assert ".rs" not in done.stderr

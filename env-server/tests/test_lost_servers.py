@@ -19,6 +19,12 @@ STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
 SMALL: dict[str, Any] = {"image_height": 8, "image_width": 8}
 
 
+def pause(process: "subprocess.Popen[str]") -> None:
+    """Stops a child and returns when it has stopped."""
+    os.kill(process.pid, signal.SIGSTOP)
+    os.waitpid(process.pid, os.WUNTRACED)
+
+
 def test_a_killed_server_is_named_and_found_again_by_reset() -> None:
     endpoint = free_endpoint()
     process = serve(endpoint)
@@ -84,7 +90,7 @@ def test_a_paused_server_is_waited_for() -> None:
     with served() as (endpoint, process):
         remote = rever_env.RemoteEnv(endpoint, **SMALL)
         remote.reset(seed=0)
-        os.kill(process.pid, signal.SIGSTOP)
+        pause(process)
         timer = threading.Timer(4.0, os.kill, (process.pid, signal.SIGCONT))
         timer.start()
         remote.step(STILL)
@@ -96,7 +102,7 @@ def test_a_server_that_does_not_answer_in_time_is_told_apart_from_one_that_is_go
     with served() as (endpoint, process):
         remote = rever_env.RemoteEnv(endpoint, **SMALL, reply_secs=2.0)
         remote.reset(seed=0)
-        os.kill(process.pid, signal.SIGSTOP)
+        pause(process)
         begun = time.monotonic()
         with pytest.raises(RemoteFault, match=rf"at {endpoint} did not answer for 2 s"):
             remote.step(STILL)
@@ -110,7 +116,7 @@ def test_a_server_that_does_not_answer_in_time_is_told_apart_from_one_that_is_go
 def test_a_stopped_server_does_not_hold_up_close() -> None:
     with served() as (endpoint, process):
         remote = rever_env.RemoteEnv(endpoint, **SMALL)
-        os.kill(process.pid, signal.SIGSTOP)
+        pause(process)
         begun = time.monotonic()
         remote.close()
         assert time.monotonic() - begun < 10.0

@@ -1,20 +1,12 @@
 //! Messages to bytes and back, strictly: a body is read only when every byte of it is meant.
 //!
-//! Reading goes: size limit → structure of the raw bytes → types → shape → values. The shape: the message, written
-//! again, must have the one that came; this refuses what serde would let pass (a struct sent as an
-//! array, an integer for a float, text for bytes, a missing optional field). The order of a map's entries is free.
+//! Reading goes: size limit → version → types → end → values. The types refuse unknown, missing and repeated fields and
+//! floats of other than 32 bits. The order of a map's entries is free.
 
-use std::borrow::Cow;
-use std::ops::Range;
-
-use bytes::Bytes;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::structure::{self, Bulk};
-
-/// A value of bytes that holds none, written.
-const NO_BYTES: &[u8] = &[0xc4, 0];
+use crate::limits::DEPTH_MAX;
 
 /// Why a message was not written or not read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -57,11 +49,6 @@ pub trait Message: Serialize + DeserializeOwned {
     /// Checks every value; the reason names the field, what was expected and what came.
     fn validate(&self) -> Result<(), String>;
 
-    /// The one value of bytes that may be large, such as a picture: what it holds has no part in the message's shape.
-    fn bulk(&mut self) -> Option<&mut Bytes> {
-        None
-    }
-
     /// Looks at the raw bytes first, so that another version is refused for its version and not for its fields.
     fn recognise(_bytes: &[u8]) -> Result<(), String> {
         Ok(())
@@ -79,39 +66,20 @@ pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
 
 /// Reads a message out of exactly `bytes`.
 pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, CodecError> {
-    valid(parse(bytes)?)
-}
-
-/// Reads a message out of exactly `bytes` and leaves its bulk where it lies there.
-pub fn decode_shared<M: Message>(bytes: &Bytes) -> Result<M, CodecError> {
-    valid(read(bytes, |content| bytes.slice(content))?)
+    let (message, invalid) = parse(bytes)?;
+    invalid.map_or(Ok(message), Err)
 }
 
 /// Reads a message whose values may be out of bounds, with what is wrong with them: a server must know which request
 /// it refuses.
 pub fn parse<M: Message>(bytes: &[u8]) -> Result<(M, Option<CodecError>), CodecError> {
-    read(bytes, |content| Bytes::copy_from_slice(&bytes[content]))
-}
-
-/// Parses `bytes` without their bulk, which `bulk_at` makes of its place: nothing large is copied on the way.
-fn read<M: Message>(
-    bytes: &[u8],
-    bulk_at: impl FnOnce(Range<usize>) -> Bytes,
-) -> Result<(M, Option<CodecError>), CodecError> {
     check_size::<M>(bytes.len())?;
     let malformed = |reason| CodecError::Malformed { message: M::NAME, reason };
-    let came = structure::check(bytes).map_err(malformed)?;
     M::recognise(bytes).map_err(|reason| CodecError::Invalid { message: M::NAME, reason })?;
-    let without =
-        |bulk: &Bulk| [&bytes[..bulk.start], NO_BYTES, &bytes[bulk.content.end..]].concat();
-    let rest = came.bulk.as_ref().map_or(Cow::Borrowed(bytes), |bulk| Cow::Owned(without(bulk)));
-    let mut message: M = rmp_serde::from_slice(&rest).map_err(|error| malformed(words(error)))?;
-    let meant = shape(&message).map_err(malformed)?;
-    if came.shape != meant {
-        return Err(malformed(format!("expected the shape {meant}, got {}", came.shape)));
-    }
-    if let (Some(place), Some(bulk)) = (message.bulk(), came.bulk) {
-        *place = bulk_at(bulk.content);
+    let (message, end): (M, usize) = first_value(bytes).map_err(malformed)?;
+    if end < bytes.len() {
+        let more = bytes.len() - end;
+        return Err(malformed(format!("expected the end after byte {end}, got {more} more bytes")));
     }
     let invalid = message.validate().err();
     Ok((message, invalid.map(|reason| CodecError::Invalid { message: M::NAME, reason })))
@@ -125,20 +93,15 @@ pub fn check_size<M: Message>(bytes: usize) -> Result<(), CodecError> {
     Ok(())
 }
 
-fn valid<M>((message, invalid): (M, Option<CodecError>)) -> Result<M, CodecError> {
-    invalid.map_or(Ok(message), Err)
-}
-
-/// serde's own sentence without the wrapping of the format.
-fn words(error: rmp_serde::decode::Error) -> String {
-    match error {
+/// The value with which `bytes` begin, and where it ends.
+pub(crate) fn first_value<T: DeserializeOwned>(bytes: &[u8]) -> Result<(T, usize), String> {
+    let mut rest = bytes;
+    let mut reader = rmp_serde::Deserializer::new(&mut rest);
+    reader.set_max_depth(DEPTH_MAX);
+    let value = T::deserialize(&mut reader).map_err(|error| match error {
+        // serde's own sentence without the wrapping of the format.
         rmp_serde::decode::Error::Syntax(reason) => reason,
         other => other.to_string(),
-    }
-}
-
-/// The shape of `message` as it is written.
-fn shape<M: Message>(message: &M) -> Result<structure::Shape, String> {
-    let written = rmp_serde::to_vec_named(message).map_err(|error| error.to_string())?;
-    Ok(structure::check(&written)?.shape)
+    })?;
+    Ok((value, bytes.len() - rest.len()))
 }

@@ -11,10 +11,9 @@ pub mod codec;
 pub mod keys;
 pub mod limits;
 pub mod message;
-mod structure;
 pub mod transport;
 
-pub use codec::{CodecError, Message, decode, decode_shared, encode};
+pub use codec::{CodecError, Message, decode, encode};
 pub use keys::{KeyError, Keys};
 pub use message::*;
 

@@ -42,3 +42,5 @@ pub const SEED_END: u64 = 1 << 53;
 pub const ACTION_DIMENSIONS_MAX: usize = 128;
 /// Numbers of a state.
 pub const STATE_DIMENSIONS_MAX: usize = ELEMENTS_MAX;
+/// Bytes of a body that a server takes off the network: what is beyond its own limit and below this is refused in words.
+pub const SERVER_MESSAGE_BYTES_MAX: usize = 1 << 20;

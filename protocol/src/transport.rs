@@ -2,33 +2,22 @@
 
 use std::fmt::Display;
 
-use crate::limits::MESSAGE_BYTES_MAX;
-
-/// A variable of the environment, from which alone zenoh takes its threads. To be set before zenoh is used.
-pub const RUNTIME_VARIABLE: &str = "ZENOH_RUNTIME";
-/// One pool for all that zenoh does, so that no message is handed from one thread to another between the socket and the
-/// callback. Several threads, for programs whose callbacks may wait: the caches of outcomes and verifiers answer in them.
-pub const RUNTIME_POOL: &str = "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), app: (worker_threads: 4))";
-/// A pool of one thread, for programs whose callbacks only hand on: threads that share messages wake one another.
-pub const RUNTIME_SINGLE: &str = "(acc: (handover: app), rx: (handover: app), tx: (handover: app), net: (handover: app), app: (worker_threads: 1))";
 /// A slow reader holds a message up that long before the link is given up.
 const CONGESTION_MICROSECONDS: u64 = 60_000_000;
-/// A reply with its picture is three of zenoh's batches or more: all of them fit into the queue at once, where two, zenoh's
-/// own choice, stop the sender until the first one is gone.
-const QUEUED_BATCHES: usize = 16;
 /// What zenoh adds to a body.
 const ENVELOPE_BYTES: usize = 65_536;
 
 /// Entries of zenoh's configuration as key and JSON value. `client_wait_ms`: how long a client waits for the router or
-/// server that it is told to connect to.
+/// server that it is told to connect to. `message_bytes_max`: larger bodies are dropped as they arrive.
 pub fn settings(
     connect: &[String],
     listen: &[String],
     multicast: bool,
     client_wait_ms: u32,
+    message_bytes_max: usize,
 ) -> Vec<(&'static str, String)> {
     // A router forwards between its clients, not between its peers, which it takes for linked. And
-    // whoever has one way out and no way in needs no more than a client does.
+    // a program with one way out and no way in needs no more than a client does.
     let is_client = connect.len() == 1 && listen.is_empty() && !multicast;
     let mut entries = vec![
         ("mode", if is_client { "\"client\"" } else { "\"peer\"" }.to_owned()),
@@ -38,12 +27,11 @@ pub fn settings(
         ("scouting/gossip/enabled", multicast.to_string()),
         // The caches of outcomes and verifiers order their samples by time.
         ("timestamping/enabled", "true".to_owned()),
-        ("transport/link/rx/max_message_size", (MESSAGE_BYTES_MAX + ENVELOPE_BYTES).to_string()),
+        ("transport/link/rx/max_message_size", (message_bytes_max + ENVELOPE_BYTES).to_string()),
         (
             "transport/link/tx/queue/congestion_control/block/wait_before_close",
             CONGESTION_MICROSECONDS.to_string(),
         ),
-        ("transport/link/tx/queue/size/data", QUEUED_BATCHES.to_string()),
     ];
     // Left out, this is a free port on every interface: what others find by multicast.
     if !listen.is_empty() || !multicast {

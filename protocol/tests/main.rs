@@ -6,9 +6,13 @@ mod examples;
 mod golden;
 /// Zenoh keys and the names that may stand in them.
 mod keys;
+/// Bytes that no encoder of ours writes and every decoder must read.
+mod other_forms;
 /// The README says what the types say.
 mod readme;
 /// Bytes that must be refused, and the words for it.
 mod refused;
 /// Pictures as the tiles that changed.
 mod tiles;
+/// What zenoh's errors say once the places in its source are taken out.
+mod transport;

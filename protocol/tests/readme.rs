@@ -169,7 +169,7 @@ fn the_readme_states_every_limit() {
         format!("heartbeat {} B", limits::HEARTBEAT_BYTES_MAX),
         format!("verifier update {}", mib(limits::VERIFIER_UPDATE_BYTES_MAX)),
         format!("nesting {}; {} elements", limits::DEPTH_MAX, limits::ELEMENTS_MAX),
-        format!("Names are 1 to {} bytes", limits::NAME_BYTES_MAX),
+        format!("Names are 1 to {} bytes without control characters", limits::NAME_BYTES_MAX),
         format!("texts up to {}", limits::TEXT_BYTES_MAX),
         format!("image sides 1 to {}, or 0 x 0", limits::IMAGE_SIDE_MAX),
         format!("slots 0 to {}", limits::SLOTS_MAX - 1),

@@ -24,7 +24,6 @@ from rever_env.protocol.reply import (
     Saved,
     Stepped,
     Transition,
-    stepped_in_layout,
 )
 from rever_env.protocol.request import (
     Close,
@@ -33,10 +32,9 @@ from rever_env.protocol.request import (
     Restore,
     Save,
     Step,
-    step_in_layout,
 )
 from rever_env.protocol.statistics import Statistics
-from rever_env.protocol.value import recognise_protocol
+from rever_env.protocol.value import printable, recognise_protocol
 from rever_env.protocol.verifier_update import VerifierUpdate
 
 __all__ = [
@@ -83,7 +81,7 @@ __all__ = [
     "TooLarge",
     "Transition",
     "VerifierUpdate",
-    "stepped_in_layout",
+    "printable",
 ]
 
 DESCRIPTION: Codec[Description] = Codec(
@@ -97,7 +95,6 @@ REQUEST: Codec[Request] = Codec(
     "request",
     limits.REQUEST_BYTES_MAX,
     {kind.__name__: kind for kind in (Reset, Step, Save, Restore, Close)},
-    in_layout=step_in_layout,
 )
 REPLY: Codec[Reply] = Codec(
     "reply",

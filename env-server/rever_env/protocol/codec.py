@@ -5,8 +5,10 @@ wire. int: unsigned, 64 bits unless annotated; float: 32 bits. The order of a ma
 when reading and the dataclass's when writing.
 """
 
+import array
 import dataclasses
 import enum
+import math
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -14,7 +16,7 @@ from typing import Any, Generic, Protocol, TypeVar, Union
 
 import msgpack
 
-from rever_env.protocol import structure
+from rever_env.protocol import limits
 
 Reader = Callable[[object], Any]
 Writer = Callable[[Any], object]
@@ -58,11 +60,7 @@ M = TypeVar("M", bound=Message)
 
 
 class Codec(Generic[M]):
-    """Writes and reads one kind of message, or one of several variants under their names.
-
-    in_layout: a short way to read what comes often. It gives what the long way would give, or None
-    where it cannot tell, as for whatever is wrong, which the long way names.
-    """
+    """Writes and reads one kind of message, or one of several variants under their names."""
 
     def __init__(
         self,
@@ -70,12 +68,10 @@ class Codec(Generic[M]):
         bytes_max: int,
         content: type[M] | Mapping[str, type[M]],
         recognise: Callable[[object], None] | None = None,
-        in_layout: Callable[[bytes], M | None] | None = None,
     ) -> None:
         self.name = name
         self.bytes_max = bytes_max
         self._recognise = recognise
-        self._in_layout = in_layout
         self._reader: Reader
         self._writer: Writer
         if isinstance(content, type):
@@ -92,14 +88,19 @@ class Codec(Generic[M]):
 
     def decode(self, data: bytes) -> M:
         """The message in exactly these bytes."""
-        message = self._in_layout(data) if self._in_layout else None
-        return self._strictly(data) if message is None else message
-
-    def _strictly(self, data: bytes) -> M:
         self.check_size(len(data))
         try:
-            structure.check(data)
-            value = msgpack.unpackb(data, object_pairs_hook=_once)
+            value = msgpack.unpackb(
+                data,
+                object_pairs_hook=_once,
+                max_array_len=limits.ELEMENTS_MAX,
+                max_map_len=limits.ELEMENTS_MAX,
+            )
+        except msgpack.ExtraData as error:
+            raise Malformed(
+                f"{self.name} cannot be read: expected the end after byte "
+                f"{len(data) - len(error.extra)}, got {len(error.extra)} more bytes"
+            ) from None
         except UnicodeDecodeError as error:
             raise Malformed(f"{self.name} cannot be read: text is not utf-8: {error}") from None
         except ValueError as error:
@@ -217,7 +218,7 @@ def _field(hint: Any) -> tuple[Reader, Writer]:
         return _integer(bits), _as_it_is
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
         return _enumeration(hint), lambda value: value.value
-    return _exactly(hint), _as_it_is
+    return (_float if hint is float else _exactly(hint)), _as_it_is
 
 
 def _integer(bits: int) -> Reader:
@@ -239,7 +240,15 @@ def _floats(value: object) -> tuple[float, ...]:
     for element in value:
         if type(element) is not float:
             raise ValueError(f"invalid type: {_kind(element)}, expected f32")
+    # MessagePack's reader tells no double from a float: a number that 32 bits do not hold was one.
+    for number, single in zip(value, array.array("f", value), strict=True):
+        if number != single and not math.isnan(number):
+            raise ValueError(f"expected 32-bit floats, got {number}")
     return tuple(value)
+
+
+def _float(value: object) -> float:
+    return _floats([value])[0]
 
 
 def _tuple(reader: Reader) -> Reader:
@@ -267,7 +276,7 @@ def _enumeration(kind: type[enum.Enum]) -> Reader:
 
 
 def _exactly(kind: type[Any]) -> Reader:
-    expected = {bool: "a boolean", str: "a string", bytes: "bytes", float: "f32"}[kind]
+    expected = {bool: "a boolean", str: "a string", bytes: "bytes"}[kind]
 
     def read(value: object) -> Any:
         if type(value) is not kind:

@@ -40,10 +40,6 @@ class Keys:
         """A holder's Request."""
         return f"{self.session(session)}/request"
 
-    def requests(self, server: str) -> str:
-        """Matches request of every session whose name is the server's, a dot and anything."""
-        return f"{self._prefix}/session/{_checked('server', server)}.$*/request"
-
     def reply(self, session: str) -> str:
         """A server's Reply."""
         return f"{self.session(session)}/reply"

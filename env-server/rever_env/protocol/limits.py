@@ -9,6 +9,8 @@ HEARTBEAT_BYTES_MAX = 512
 OUTCOME_BYTES_MAX = 4096
 VERIFIER_UPDATE_BYTES_MAX = 64 << 20
 MESSAGE_BYTES_MAX = VERIFIER_UPDATE_BYTES_MAX  # what a transport must be willing to carry
+# What a server takes off the network: beyond its own limit and below this it refuses in words.
+SERVER_MESSAGE_BYTES_MAX = 1 << 20
 
 NAME_BYTES_MAX = 128  # task, variant, run, strategy, holder, server, session, digest
 TEXT_BYTES_MAX = 1024  # instruction, reason, simulator

@@ -1,6 +1,7 @@
 """Types and checks of single values, worded once for every message."""
 
 import math
+import re
 from collections.abc import Sized
 from typing import Annotated
 
@@ -8,6 +9,7 @@ from rever_env.protocol import limits
 from rever_env.protocol.codec import Bits
 from rever_env.protocol.keys import PROTOCOL_VERSION
 
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 U32 = Annotated[int, Bits(32)]
 
 
@@ -22,10 +24,18 @@ class Numbered:
 
 
 def name(field: str, value: str) -> None:
-    """A name: not empty, not long."""
+    """A name: not empty, not long, and harmless in a terminal."""
     count = len(value.encode())
     if not 1 <= count <= limits.NAME_BYTES_MAX:
         raise ValueError(f"{field}: expected 1 to {limits.NAME_BYTES_MAX} bytes, got {count}")
+    found = _CONTROL.search(value)
+    if found:
+        raise ValueError(f"{field}: expected no control characters, got U+{ord(found[0]):04X}")
+
+
+def printable(text: str) -> str:
+    """A peer's text for a terminal or a log: without control characters."""
+    return _CONTROL.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def text(field: str, value: str) -> None:

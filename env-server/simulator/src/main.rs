@@ -2,18 +2,22 @@
 //!
 //! ```text
 //! serving     the network, and how it ends       trace     every number of an episode, to be compared
-//!   server    leases, queue, heartbeat           session   numbered requests, slots
+//!   server    leases, heartbeat                  session   numbered requests, slots
+//!     inbox, outbox       what waits for the simulation thread, and what it sends
 //!   worlds    idle worlds                        world     one task in MuJoCo: reset, step, save, restore
-//!     mjcf, model, controller, success, expert, layout, camera    tasks   assets/tasks.toml
+//!     mjcf, model, controller, success, expert, layout, camera    tasks, assets   tasks.toml and the scenes
 //! ```
 
+mod assets;
 mod camera;
 mod controller;
 mod expert;
 mod fault;
+mod inbox;
 mod layout;
 mod mjcf;
 mod model;
+mod outbox;
 mod server;
 mod serving;
 mod session;
@@ -27,16 +31,16 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
+use assets::Assets;
 use clap::{Parser, Subcommand};
-use protocol::transport::{RUNTIME_POOL, RUNTIME_SINGLE, RUNTIME_VARIABLE};
 
-/// The world of rever_env, natively.
+/// The Bridge tasks in MuJoCo: environment server and traces
 #[derive(Parser)]
 #[command(version)]
 struct Program {
-    /// The folder with tasks.toml and the scenes.
+    /// Read tasks.toml and the scenes from this folder instead of the built-in ones.
     #[arg(long, value_name = "FOLDER")]
-    assets: PathBuf,
+    assets: Option<PathBuf>,
     #[command(subcommand)]
     command: Command,
 }
@@ -48,16 +52,10 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    // What an agent has set for itself comes down to the servers that it starts, and is no user's choice.
-    let defaults = [
-        (RUNTIME_VARIABLE, RUNTIME_SINGLE, RUNTIME_POOL),
-        (camera::DRAWING_THREADS.0, camera::DRAWING_THREADS.1, camera::DRAWING_THREADS.1),
-    ];
-    for (name, value, inherited) in defaults {
-        if std::env::var_os(name).is_none_or(|chosen| chosen == inherited) {
-            // SAFETY: no other thread runs yet that could read the environment.
-            unsafe { std::env::set_var(name, value) };
-        }
+    let (name, value) = camera::DRAWING_THREADS;
+    if std::env::var_os(name).is_none() {
+        // SAFETY: no other thread runs yet that could read the environment.
+        unsafe { std::env::set_var(name, value) };
     }
     let program = Program::parse();
     tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).init();
@@ -71,7 +69,7 @@ fn main() -> ExitCode {
 }
 
 fn run(program: Program) -> Result<()> {
-    let tasks = tasks::load(&program.assets)?;
+    let tasks = tasks::load(&program.assets.map_or(Assets::BuiltIn, Assets::Folder))?;
     match program.command {
         Command::Serve(arguments) => serving::serve(arguments, tasks),
         Command::Trace(arguments) => trace::trace(arguments, tasks),

@@ -1,25 +1,23 @@
 //! A task's scene in MuJoCo's XML: its includes in place, and what the task changes in it.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::BufReader;
-use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
 use xmltree::{Element, XMLNode};
 
+use crate::assets::Assets;
 use crate::tasks::Task;
 
 /// The scene as one text, for MuJoCo's compiler.
 pub fn scene(task: &Task) -> Result<String> {
-    let mut root = included(&task.scene)?;
+    let mut root = included(&task.assets, &task.rule.scene)?;
     for (element, names) in &task.rule.mjcf {
         for (name, attributes) in names {
             let count = change(&mut root, None, (element, name), attributes);
             ensure!(
                 count == 1,
                 "{}: expected one {element} named {name}, got {count}",
-                task.scene.display()
+                task.rule.scene
             );
         }
     }
@@ -47,25 +45,25 @@ fn change(
     usize::from(is_it) + below.sum::<usize>()
 }
 
-fn included(path: &Path) -> Result<Element> {
-    let file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let mut root = Element::parse(BufReader::new(file))
-        .with_context(|| format!("cannot read {}", path.display()))?;
-    include(&mut root, path)?;
+fn included(assets: &Assets, name: &str) -> Result<Element> {
+    let text = assets.text(name)?;
+    let mut root =
+        Element::parse(text.as_bytes()).with_context(|| format!("cannot read {name}"))?;
+    include(&mut root, assets)?;
     Ok(root)
 }
 
 /// Puts the content of other files in the place of include elements.
-fn include(node: &mut Element, path: &Path) -> Result<()> {
+fn include(node: &mut Element, assets: &Assets) -> Result<()> {
     let mut children = Vec::new();
     for child in std::mem::take(&mut node.children) {
         match child {
             XMLNode::Element(element) if element.name == "include" => {
                 let file = element.attributes.get("file").context("an include without a file")?;
-                children.extend(included(&path.with_file_name(file))?.children);
+                children.extend(included(assets, file)?.children);
             }
             XMLNode::Element(mut element) => {
-                include(&mut element, path)?;
+                include(&mut element, assets)?;
                 children.push(XMLNode::Element(element));
             }
             other => children.push(other),

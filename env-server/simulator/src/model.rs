@@ -41,8 +41,7 @@ pub fn compile(task: &Task) -> Result<(Arc<MjModel>, Names), Fault> {
     if timestep != task.settings.timestep {
         return Err(Fault::Internal(format!(
             "{}: expected the time step of tasks.toml, {}, got {timestep}",
-            task.scene.display(),
-            task.settings.timestep
+            task.rule.scene, task.settings.timestep
         )));
     }
     let names = names(&model, task)?;
@@ -55,7 +54,7 @@ fn names(model: &MjModel, task: &Task) -> Result<Names, Fault> {
         model.name_to_id(kind, name).ok_or_else(|| {
             Fault::Internal(format!(
                 "{}: expected {name:?} in it, got none ({kind:?})",
-                task.scene.display()
+                task.rule.scene
             ))
         })
     };

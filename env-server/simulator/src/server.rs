@@ -1,26 +1,27 @@
 //! Sessions over zenoh, all stepped by one thread: the one that owns the rendering contexts.
 //!
-//! zenoh's threads only enqueue: callback -> bounded queue -> simulation thread -> session -> reply.
+//! callback -> inbox -> simulation thread -> session -> outbox: neither zenoh's threads nor the simulation thread wait
+//! for a peer.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow, ensure};
-use bytes::Bytes;
 use protocol::{
-    Description, Heartbeat, Keys, Open, Opening, PROTOCOL_VERSION, Request, TaskDescription, codec,
-    decode, encode, limits,
+    CodecError, Description, Heartbeat, Keys, Open, Opening, PROTOCOL_VERSION, TaskDescription,
+    codec, decode, encode, limits,
 };
 use zenoh::liveliness::LivelinessToken;
-use zenoh::pubsub::{Publisher, Subscriber};
+use zenoh::pubsub::Subscriber;
 use zenoh::qos::{CongestionControl, Priority, Reliability};
-use zenoh::query::Query;
+use zenoh::query::{Query, Queryable};
 use zenoh::sample::SampleKind;
 use zenoh::{Session as Network, Wait};
 
+use crate::inbox::{Inbox, Work};
+use crate::outbox::{Answers, Outbox};
 use crate::session::{Session, refused};
 use crate::worlds::Worlds;
 
@@ -29,13 +30,11 @@ const BEAT: Duration = Duration::from_millis(500);
 const HOLDER_WAIT_MAX: Duration = Duration::from_secs(10);
 /// A closed session still answers: its last reply may have been lost.
 const CLOSED_WAIT_MAX: Duration = Duration::from_secs(10);
-/// Requests waiting in the queue; the holder resends what is dropped.
-const PENDING_PER_SESSION_MAX: usize = 4;
 
 /// What a server offers.
 #[derive(Debug, Clone)]
 pub struct ServerOptions {
-    /// Who meets whom.
+    /// Peers see each other only within the same fleet.
     pub fleet: String,
     /// At once.
     pub sessions_max: u32,
@@ -50,38 +49,20 @@ pub struct Server<'a> {
     keys: Keys,
     leases: HashMap<String, Lease>,
     ended_steps: u64,
-    work: Receiver<Work>,
-    enqueue: SyncSender<Work>,
-}
-
-/// What zenoh's threads leave to the simulation thread.
-enum Work {
-    Describe(Query),
-    Open(Query),
-    Request {
-        session: String,
-        bytes: zenoh::bytes::ZBytes,
-    },
-    /// A holder is gone.
-    Look,
+    inbox: Arc<Inbox>,
+    answers: Answers,
 }
 
 /// A session with what zenoh holds for it.
 struct Lease {
     session: Session,
     opened_at: Instant,
-    signs: Arc<Mutex<Signs>>,
-    publisher: Publisher<'static>,
+    closed_at: Option<Instant>,
+    /// zenoh's threads write it.
+    holder: Arc<Mutex<Holder>>,
+    outbox: Outbox,
     _requests: Subscriber<()>,
-    _holder: Subscriber<()>,
-}
-
-/// What zenoh's threads write at once: a simulation thread that was busy for long must not take what
-/// waits in its queue for silence.
-#[derive(Clone, Copy)]
-struct Signs {
-    used_at: Instant,
-    holder: Holder,
+    _token: Subscriber<()>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -93,14 +74,7 @@ enum Holder {
 
 impl<'a> Server<'a> {
     pub fn new(network: &'a Network, worlds: Worlds, options: ServerOptions) -> Result<Server<'a>> {
-        let sessions_max = options.sessions_max;
-        ensure!(
-            (1..=limits::SESSIONS_MAX).contains(&sessions_max),
-            "sessions: expected 1 to {}, got {sessions_max}",
-            limits::SESSIONS_MAX
-        );
         let keys = Keys::new(&options.fleet)?;
-        let (enqueue, work) = sync_channel((sessions_max as usize + 1) * PENDING_PER_SESSION_MAX);
         let server = Server {
             id: fresh_id(),
             network,
@@ -109,8 +83,8 @@ impl<'a> Server<'a> {
             keys,
             leases: HashMap::new(),
             ended_steps: 0,
-            work,
-            enqueue,
+            inbox: Arc::default(),
+            answers: Answers::new()?,
         };
         // What cannot be described is refused now.
         encode(&server.description())?;
@@ -120,18 +94,8 @@ impl<'a> Server<'a> {
     /// Declares everything, the liveliness token last; then works until `stop` is set.
     pub fn run(mut self, stop: &AtomicBool, ready: impl FnOnce(&str) -> Result<()>) -> Result<()> {
         let network = self.network;
-        let enqueue = self.enqueuing();
-        let _describe = network
-            .declare_queryable(self.keys.describe(&self.id)?)
-            .callback(move |query| enqueue(Work::Describe(query)))
-            .wait()
-            .map_err(in_words)?;
-        let enqueue = self.enqueuing();
-        let _open = network
-            .declare_queryable(self.keys.open(&self.id)?)
-            .callback(move |query| enqueue(Work::Open(query)))
-            .wait()
-            .map_err(in_words)?;
+        let _describe = self.queryable(self.keys.describe(&self.id)?, Work::Describe)?;
+        let _open = self.queryable(self.keys.open(&self.id)?, Work::Open)?;
         let heartbeat = network
             .declare_publisher(self.keys.heartbeat(&self.id)?)
             .congestion_control(CongestionControl::Drop)
@@ -152,39 +116,40 @@ impl<'a> Server<'a> {
                 self.end_abandoned(now);
                 beat_at = now + BEAT;
             }
-            match self.work.recv_timeout(beat_at.saturating_duration_since(now)) {
-                Ok(work) => self.perform(work)?,
-                Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => {
-                    unreachable!("the server itself holds a sender")
-                }
+            if let Some(work) = self.inbox.take(beat_at) {
+                self.perform(work)?;
             }
         }
         Ok(())
     }
 
-    /// Leaves work to the simulation thread and drops what is too much.
-    fn enqueuing(&self) -> impl Fn(Work) + Send + Sync + 'static {
-        let sender = self.enqueue.clone();
-        move |work| {
-            if sender.try_send(work).is_err() {
-                tracing::warn!("more is asked than the queue of requests holds");
-            }
-        }
+    /// Leaves the queries on `key` to the simulation thread and drops what is too much.
+    fn queryable(&self, key: String, work: fn(Query) -> Work) -> Result<Queryable<()>> {
+        let (inbox, answers) = (Arc::clone(&self.inbox), self.answers.clone());
+        self.network
+            .declare_queryable(key)
+            .callback(move |query| {
+                if let Err(Work::Describe(query) | Work::Open(query)) = inbox.put_query(work(query))
+                {
+                    answers.discard(query);
+                }
+            })
+            .wait()
+            .map_err(in_words)
     }
 
     fn perform(&mut self, work: Work) -> Result<()> {
         match work {
             Work::Describe(query) => {
                 let bytes = encode(&self.description())?;
-                answer(&query, &self.keys.describe(&self.id)?, bytes);
+                self.answers.send(query, self.keys.describe(&self.id)?, bytes);
             }
             Work::Open(query) => {
-                let opening = self.open(&query);
-                answer(&query, &self.keys.open(&self.id)?, encode(&opening)?);
+                let bytes = encode(&self.open(&query))?;
+                self.answers.send(query, self.keys.open(&self.id)?, bytes);
             }
-            Work::Request { session, bytes } => self.answer(&session, &bytes),
-            Work::Look => self.end_abandoned(Instant::now()),
+            Work::Request { session, bytes } => self.answer(&session, bytes),
+            Work::HolderGone => self.end_abandoned(Instant::now()),
         }
         Ok(())
     }
@@ -249,76 +214,79 @@ impl<'a> Server<'a> {
             .express(true)
             .wait()
             .map_err(in_words)?;
-        let now = Instant::now();
-        let signs = Arc::new(Mutex::new(Signs { used_at: now, holder: Holder::Awaited }));
-        let (enqueue, of, seen) = (self.enqueuing(), name.clone(), Arc::clone(&signs));
+        let outbox = Outbox::new(publisher)?;
+        self.inbox.admit(&name);
+        let (inbox, of) = (Arc::clone(&self.inbox), name.clone());
         let requests = self
             .network
             .declare_subscriber(self.keys.request(&name)?)
-            .callback(move |sample| {
-                locked(&seen).used_at = Instant::now();
-                enqueue(Work::Request { session: of.clone(), bytes: sample.payload().clone() });
-            })
+            .callback(move |sample| inbox.put_request(&of, sample.payload()))
             .wait()
             .map_err(in_words)?;
-        let (enqueue, seen) = (self.enqueuing(), Arc::clone(&signs));
-        let holder_token = self
-            .network
-            .liveliness()
-            .declare_subscriber(self.keys.session(&name)?)
-            .history(true)
-            .callback(move |sample| {
-                let mut signs = locked(&seen);
-                signs.holder = match (sample.kind(), signs.holder) {
-                    (SampleKind::Put, _) => Holder::Alive,
-                    (SampleKind::Delete, Holder::Alive) => Holder::Gone,
-                    (SampleKind::Delete, before) => before,
-                };
-                if signs.holder == Holder::Gone {
-                    // At once, or with the next heartbeat if the queue is full.
-                    enqueue(Work::Look);
-                }
-            })
-            .wait()
-            .map_err(in_words)?;
+        let seen = Arc::new(Mutex::new(Holder::Awaited));
+        let token = self.watch(&name, Arc::clone(&seen))?;
         let lease = Lease {
             session,
-            opened_at: now,
-            signs,
-            publisher,
+            opened_at: Instant::now(),
+            closed_at: None,
+            holder: seen,
+            outbox,
             _requests: requests,
-            _holder: holder_token,
+            _token: token,
         };
         self.leases.insert(name.clone(), lease);
         tracing::info!("session {name} opened for {holder}");
         Ok(name)
     }
 
-    fn answer(&mut self, name: &str, bytes: &zenoh::bytes::ZBytes) {
+    /// Notes when the token of the session's holder comes and goes.
+    fn watch(&self, name: &str, seen: Arc<Mutex<Holder>>) -> Result<Subscriber<()>> {
+        let inbox = Arc::clone(&self.inbox);
+        self.network
+            .liveliness()
+            .declare_subscriber(self.keys.session(name)?)
+            .history(true)
+            .callback(move |sample| {
+                let mut holder = locked(&seen);
+                *holder = match (sample.kind(), *holder) {
+                    (SampleKind::Put, _) => Holder::Alive,
+                    (SampleKind::Delete, Holder::Alive) => Holder::Gone,
+                    (SampleKind::Delete, before) => before,
+                };
+                if *holder == Holder::Gone {
+                    inbox.put_holder_gone();
+                }
+            })
+            .wait()
+            .map_err(in_words)
+    }
+
+    fn answer(&mut self, name: &str, bytes: Result<Vec<u8>, CodecError>) {
         let Some(lease) = self.leases.get_mut(name) else { return };
-        let reply = match codec::check_size::<Request>(bytes.len()) {
-            Ok(()) => lease.session.answer(&bytes.to_bytes(), &mut self.worlds),
+        let reply = match bytes {
+            Ok(bytes) => lease.session.answer(&bytes, &mut self.worlds),
             Err(error) => Some(refused(0, &error.to_string())),
         };
-        if let Some(reply) = reply {
-            publish(&lease.publisher, reply);
+        if lease.session.closed && lease.closed_at.is_none() {
+            lease.closed_at = Some(Instant::now());
         }
-        // However long that took, its holder was not the silent one.
-        locked(&lease.signs).used_at = Instant::now();
+        if let Some(reply) = reply {
+            lease.outbox.send(reply);
+        }
     }
 
     fn end_abandoned(&mut self, now: Instant) {
+        let since = |then: Instant| now.saturating_duration_since(then);
         let mut ended = Vec::new();
         for (name, lease) in &self.leases {
-            let Signs { used_at, holder } = *locked(&lease.signs);
-            let idle = now.saturating_duration_since(used_at);
-            if lease.session.closed && idle > CLOSED_WAIT_MAX {
-                ended.push((name.clone(), None));
+            let holder = *locked(&lease.holder);
+            if let Some(closed_at) = lease.closed_at {
+                if since(closed_at) > CLOSED_WAIT_MAX || holder == Holder::Gone {
+                    ended.push((name.clone(), None));
+                }
             } else if holder == Holder::Gone {
                 ended.push((name.clone(), Some("its holder is gone".to_owned())));
-            } else if holder == Holder::Awaited
-                && now.saturating_duration_since(lease.opened_at) > HOLDER_WAIT_MAX
-            {
+            } else if holder == Holder::Awaited && since(lease.opened_at) > HOLDER_WAIT_MAX {
                 let seconds = HOLDER_WAIT_MAX.as_secs();
                 let reason = format!("expected its holder's token within {seconds} s");
                 ended.push((name.clone(), Some(reason)));
@@ -331,10 +299,11 @@ impl<'a> Server<'a> {
 
     fn end(&mut self, name: &str, reason: Option<&str>) {
         let Some(mut lease) = self.leases.remove(name) else { return };
+        self.inbox.forget(name);
         self.ended_steps += lease.session.steps;
         if let Some(reason) = reason {
             tracing::info!("session {name} ended: {reason}");
-            publish(&lease.publisher, refused(0, &format!("session {name} ended: {reason}")));
+            lease.outbox.send(refused(0, &format!("session {name} ended: {reason}")));
         }
         lease.session.end(&mut self.worlds);
     }
@@ -356,22 +325,8 @@ impl<'a> Server<'a> {
 }
 
 /// Nothing that holds it can leave it half written.
-fn locked(signs: &Mutex<Signs>) -> MutexGuard<'_, Signs> {
-    signs.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// A reply that cannot be sent is asked for again, or its holder is gone.
-fn publish(publisher: &Publisher<'_>, bytes: Bytes) {
-    if let Err(error) = publisher.put(bytes).wait() {
-        tracing::warn!("a reply was not sent: {error}");
-    }
-}
-
-/// Whoever asked may be gone.
-fn answer(query: &Query, key: &str, bytes: Vec<u8>) {
-    if let Err(error) = query.reply(key, bytes).wait() {
-        tracing::warn!("a query was not answered: {error}");
-    }
+fn locked(holder: &Mutex<Holder>) -> MutexGuard<'_, Holder> {
+    holder.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn fresh_id() -> String {
@@ -379,7 +334,7 @@ fn fresh_id() -> String {
 }
 
 fn in_words(error: zenoh::Error) -> anyhow::Error {
-    anyhow!("zenoh: {error}")
+    anyhow!("zenoh: {}", protocol::transport::in_words(error))
 }
 
 /// Memory that this process holds; 0 where the system does not tell.

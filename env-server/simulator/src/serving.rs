@@ -1,6 +1,6 @@
 //! The serve subcommand: its arguments, the network it opens, and how it ends.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, ensure};
 use clap::Args;
+use protocol::{KeyError, Keys, limits, transport};
 use tokio::runtime::Builder;
 use tokio::signal::unix::{SignalKind, signal};
 use zenoh::Wait;
@@ -20,62 +21,78 @@ use crate::worlds::Worlds;
 const PARENT_POLL: Duration = Duration::from_millis(500);
 /// A wedged simulation is given up after that.
 const FINISH_WAIT_MAX: Duration = Duration::from_secs(10);
+const CLOSE_WAIT_MAX: Duration = Duration::from_secs(3);
 /// A client waits this long for the router or agent that it is told to connect to.
 const CLIENT_WAIT_MS: u32 = 30_000;
 
-/// Offer the worlds over zenoh
+/// Serve the Bridge tasks over zenoh until a signal arrives
 #[derive(Debug, Args)]
 #[group(skip)]
 pub struct Arguments {
-    /// A router or agent, as tcp/127.0.0.1:7447; may be repeated.
-    #[arg(long, value_name = "ENDPOINT")]
-    connect: Vec<String>,
-    /// Where others may connect; may be repeated.
-    #[arg(long, value_name = "ENDPOINT")]
-    listen: Vec<String>,
-    /// Find others by multicast; without --listen, on every interface.
-    #[arg(long)]
-    multicast: bool,
-    /// Offer these alone: TASK, TASK/VARIANT, TASK/all; every task in every variant if left out.
+    #[command(flatten)]
+    ways: Ways,
+    /// Serve only these: TASK, TASK/VARIANT or TASK/all; every task in every variant by default.
     #[arg(long, num_args = 1.., value_name = "TASK")]
     tasks: Vec<String>,
-    /// Who meets whom.
-    #[arg(long, default_value = "local")]
+    /// Namespace: peers see each other only within the same fleet.
+    #[arg(long, value_name = "NAME", default_value = "local", value_parser = fleet)]
     fleet: String,
-    /// At once.
-    #[arg(long, default_value_t = 16)]
+    /// Largest number of sessions open at the same time.
+    #[arg(
+        long, value_name = "COUNT", default_value_t = 16,
+        value_parser = clap::value_parser!(u32).range(1..=limits::SESSIONS_MAX.into())
+    )]
     sessions: u32,
-    /// End when this parent process is gone.
+    /// Exit when the process with this id is no longer the parent of this one.
     #[arg(long, value_name = "PID")]
     exit_with_parent: Option<u32>,
-    /// The server's id is written there when it is ready.
+    /// Write the server's id into this file when it is ready.
     #[arg(long, value_name = "FILE")]
     id_file: Option<PathBuf>,
 }
 
-/// Serves until a signal comes or the parent is gone; prints `ready {server id}` when it can.
+/// At least one of them is needed.
+#[derive(Debug, Args)]
+#[group(required = true, multiple = true)]
+struct Ways {
+    /// Endpoint of a router or an agent to connect to, such as tcp/127.0.0.1:7447. Repeatable.
+    #[arg(long, value_name = "ENDPOINT")]
+    connect: Vec<String>,
+    /// Endpoint to listen on, such as tcp/127.0.0.1:7448. Every peer that reaches it is trusted. Repeatable.
+    #[arg(long, value_name = "ENDPOINT")]
+    listen: Vec<String>,
+    /// Discover peers by multicast; without --listen, listen on every interface.
+    #[arg(long)]
+    multicast: bool,
+}
+
+/// Serves until a signal comes or the parent is gone; prints a line that begins with `ready {server id}` when it can.
 pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
-    let Arguments { connect, listen, multicast, .. } = &arguments;
-    ensure!(
-        *multicast || !connect.is_empty() || !listen.is_empty(),
-        "expected --connect, --listen or --multicast, got none"
-    );
     let tasks = match arguments.tasks.as_slice() {
         [] => tasks,
         names => tasks::choose(tasks, names)?,
     };
+    if let Some(path) = &arguments.id_file {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        ensure!(
+            folder.is_none_or(Path::is_dir),
+            "--id-file {}: expected it in a folder that exists",
+            path.display()
+        );
+    }
     let stop = Arc::new(AtomicBool::new(false));
     stop_on_signals(Arc::clone(&stop))?;
-    let network = zenoh::open(configuration(&arguments)?)
+    let network = zenoh::open(configuration(&arguments.ways)?)
         .wait()
-        .map_err(|error| anyhow!("cannot open the network: {error}"))?;
+        .map_err(|error| anyhow!("cannot open the network: {}", transport::in_words(error)))?;
+    let offer = offer(&arguments, &tasks);
     let options = ServerOptions { fleet: arguments.fleet, sessions_max: arguments.sessions };
     let id_file = arguments.id_file;
     let ready = move |id: &str| -> Result<()> {
         if let Some(path) = &id_file {
             std::fs::write(path, id).with_context(|| format!("cannot write {}", path.display()))?;
         }
-        println!("ready {id}");
+        println!("ready {id} {offer}");
         Ok(())
     };
     let (done, ended) = mpsc::channel();
@@ -95,11 +112,53 @@ pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
         FINISH_WAIT_MAX.as_secs()
     );
     thread.join().map_err(|_| anyhow!("the simulation thread panicked"))?;
-    network.close().wait().map_err(|error| anyhow!("cannot close the network: {error}"))?;
+    close(network)?;
     result.unwrap_or(Ok(()))
 }
 
-/// Ctrl-C and a polite end; whoever is not polite needs no handler.
+/// Leaves the rest to the end of the process where zenoh waits for a peer that reads nothing.
+fn close(network: zenoh::Session) -> Result<()> {
+    let (done, closed) = mpsc::channel();
+    thread::Builder::new().name("closing".to_owned()).spawn(move || {
+        // Nobody listens any more once that took too long.
+        let _ = done.send(network.close().wait());
+    })?;
+    match closed.recv_timeout(CLOSE_WAIT_MAX) {
+        Ok(result) => result
+            .map_err(|error| anyhow!("cannot close the network: {}", transport::in_words(error))),
+        Err(_) => Ok(()),
+    }
+}
+
+/// A name that may stand in keys.
+fn fleet(name: &str) -> Result<String, KeyError> {
+    Keys::new(name).map(|_| name.to_owned())
+}
+
+/// Where the server is found, and what it serves.
+fn offer(arguments: &Arguments, tasks: &[Task]) -> String {
+    let Arguments { ways: Ways { connect, listen, multicast }, fleet, .. } = arguments;
+    let mut ways = Vec::new();
+    if !listen.is_empty() {
+        ways.push(format!("listening on {}", listen.join(", ")));
+    }
+    if !connect.is_empty() {
+        ways.push(format!("connected to {}", connect.join(", ")));
+    }
+    if *multicast {
+        ways.push("discovered by multicast".to_owned());
+    }
+    let variants = tasks.chunk_by(|one, next| one.id.task == next.id.task);
+    let tasks: Vec<String> = variants
+        .map(|some| match some {
+            [task] => task.id.to_string(),
+            some => format!("{} in {} variants", some[0].id.task, some.len()),
+        })
+        .collect();
+    format!("{} (fleet {fleet}): {}", ways.join(", "), tasks.join(", "))
+}
+
+/// SIGINT and SIGTERM.
 fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<()> {
     let runtime = Builder::new_current_thread().enable_io().build()?;
     let mut signals = runtime.block_on(async {
@@ -143,13 +202,21 @@ fn wait(
     ended.recv_timeout(FINISH_WAIT_MAX).ok()
 }
 
-fn configuration(arguments: &Arguments) -> Result<zenoh::Config> {
+fn configuration(ways: &Ways) -> Result<zenoh::Config> {
     let mut configuration = zenoh::Config::default();
-    let Arguments { connect, listen, multicast, .. } = arguments;
-    for (key, value) in protocol::transport::settings(connect, listen, *multicast, CLIENT_WAIT_MS) {
-        configuration
-            .insert_json5(key, &value)
-            .map_err(|error| anyhow!("zenoh does not take {key} = {value}: {error}"))?;
+    let Ways { connect, listen, multicast } = ways;
+    let settings = transport::settings(
+        connect,
+        listen,
+        *multicast,
+        CLIENT_WAIT_MS,
+        limits::SERVER_MESSAGE_BYTES_MAX,
+    );
+    for (key, value) in settings {
+        configuration.insert_json5(key, &value).map_err(|error| {
+            let cause = transport::in_words(error);
+            anyhow!("zenoh does not take {key} = {value}: {cause}")
+        })?;
     }
     Ok(configuration)
 }

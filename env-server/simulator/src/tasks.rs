@@ -2,17 +2,20 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use protocol::Dimension;
 use serde::Deserialize;
 use toml::{Table, Value};
 
+use crate::assets::Assets;
+
 /// Numbers of an action: translation in metres, rotation vector in radians, gripper +1 open or -1 closed.
 pub const ACTION_LENGTH: usize = 7;
 /// Numbers of a state, in Bridge's order: x y z roll pitch yaw pad gripper.
 pub const STATE_LENGTH: usize = 8;
+
+const FILE: &str = "tasks.toml";
 
 /// The variant of a task as its own table describes it.
 pub const DEFAULT: &str = "default";
@@ -126,7 +129,7 @@ pub struct GraspRule {
 #[derive(Debug, Clone)]
 pub struct Task {
     pub id: TaskId,
-    pub scene: PathBuf,
+    pub assets: Assets,
     pub rule: TaskRule,
     pub state: Vec<Dimension>,
     pub action: Vec<Dimension>,
@@ -244,13 +247,9 @@ impl fmt::Display for TaskId {
     }
 }
 
-/// All tasks of a folder with tasks.toml and scenes in all variants, in the file's order; unknown or missing keys are
-/// errors.
-pub fn load(assets: &Path) -> Result<Vec<Task>> {
-    let path = assets.join("tasks.toml");
-    let text = std::fs::read_to_string(&path)
-        .with_context(|| format!("cannot read {}", path.display()))?;
-    read(&text, assets).with_context(|| format!("cannot read {}", path.display()))
+/// All tasks of tasks.toml in all variants, in the file's order; unknown or missing keys are errors.
+pub fn load(assets: &Assets) -> Result<Vec<Task>> {
+    read(&assets.text(FILE)?, assets).with_context(|| format!("cannot read {FILE}"))
 }
 
 /// The named tasks in the file's order: TASK, TASK/VARIANT, TASK/all, or all.
@@ -271,7 +270,7 @@ pub fn choose(tasks: Vec<Task>, names: &[String]) -> Result<Vec<Task>> {
     Ok(tasks.into_iter().filter(is_chosen).collect())
 }
 
-fn read(text: &str, assets: &Path) -> Result<Vec<Task>> {
+fn read(text: &str, assets: &Assets) -> Result<Vec<Task>> {
     let File { state, action, world, inverse_kinematics, grasp, tasks } = toml::from_str(text)?;
     let (state, action) = (state.map(Dimension::from), action.map(Dimension::from));
     let mut read = Vec::new();
@@ -299,7 +298,7 @@ fn read(text: &str, assets: &Path) -> Result<Vec<Task>> {
             rule.place_distractors().with_context(|| place)?;
             read.push(Task {
                 id: TaskId { task: name.clone(), variant },
-                scene: assets.join(&rule.scene),
+                assets: assets.clone(),
                 rule,
                 state: state.to_vec(),
                 action: action.to_vec(),

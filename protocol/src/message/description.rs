@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{single, value};
+use super::{strict, value};
 use crate::codec::Message;
 use crate::limits::{
     ACTION_DIMENSIONS_MAX, DESCRIPTION_BYTES_MAX, IMAGE_SIDE_MAX, SESSIONS_MAX, SLOTS_MAX,
@@ -16,10 +16,10 @@ pub struct Dimension {
     /// What it is, such as `x` or `gripper`.
     pub name: String,
     /// Lowest value, where there is one.
-    #[serde(deserialize_with = "single::maybe_one")]
+    #[serde(deserialize_with = "strict::optional_float")]
     pub low: Option<f32>,
     /// Highest value, where there is one.
-    #[serde(deserialize_with = "single::maybe_one")]
+    #[serde(deserialize_with = "strict::optional_float")]
     pub high: Option<f32>,
     /// Whether only the whole numbers from `low` to `high` count.
     pub discrete: bool,
@@ -40,7 +40,7 @@ pub struct TaskDescription {
     /// Steps after which an episode is truncated.
     pub steps_max: u32,
     /// Control steps per second of simulated time, where it is known.
-    #[serde(deserialize_with = "single::maybe_one")]
+    #[serde(deserialize_with = "strict::optional_float")]
     pub control_hz: Option<f32>,
     /// Fixed layouts, numbered from 0; the random ones lie beside them.
     pub layouts: u32,

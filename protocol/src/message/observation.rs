@@ -3,7 +3,7 @@
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
-use super::{single, value};
+use super::{strict, value};
 use crate::limits::{ACTION_DIMENSIONS_MAX, STATE_DIMENSIONS_MAX};
 
 /// A picture; 0 x 0 where none was asked for.
@@ -26,12 +26,12 @@ pub struct Observation {
     pub image: Image,
     /// As the task's description says. Of a Bridge task: x y z in metres, roll pitch yaw in radians, 0, gripper
     /// opening 0 to 1; base frame.
-    #[serde(deserialize_with = "single::list")]
+    #[serde(deserialize_with = "strict::floats")]
     pub state: Vec<f32>,
     /// What the robot is told to do.
     pub instruction: String,
     /// The scripted expert's action at this state; only in a session opened with `expert`.
-    #[serde(deserialize_with = "single::maybe_list")]
+    #[serde(deserialize_with = "strict::optional_floats")]
     pub expert_action: Option<Vec<f32>>,
 }
 

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Statistics, single, value};
+use super::{Statistics, strict, value};
 use crate::codec::Message;
 use crate::limits::{OUTCOME_BYTES_MAX, SEED_END};
 
@@ -17,6 +17,7 @@ pub struct EpisodeOutcome {
     /// `default`, or what is changed.
     pub variant: String,
     /// One of the fixed layouts; none: a random layout.
+    #[serde(deserialize_with = "strict::optional")]
     pub layout: Option<u32>,
     /// Of the layout.
     pub seed: u64,
@@ -27,18 +28,19 @@ pub struct EpisodeOutcome {
     /// Candidates per step.
     pub candidates: u32,
     /// Of the sampling.
-    #[serde(deserialize_with = "single::one")]
+    #[serde(deserialize_with = "strict::float")]
     pub temperature: f32,
     /// Digest of the policy's weights.
     pub policy: String,
     /// Digest of the verifier's weights, when one scored.
+    #[serde(deserialize_with = "strict::optional")]
     pub verifier: Option<String>,
     /// As of the last step.
     pub statistics: Statistics,
     /// Control steps.
     pub steps: u32,
     /// Mean score of the executed candidates, when a verifier scored.
-    #[serde(deserialize_with = "single::maybe_one")]
+    #[serde(deserialize_with = "strict::optional_float")]
     pub score_mean: Option<f32>,
     /// The simulator with its version.
     pub simulator: String,

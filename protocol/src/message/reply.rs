@@ -2,10 +2,9 @@
 
 use std::fmt;
 
-use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
-use super::{Observation, Statistics, single, value};
+use super::{Observation, Statistics, strict, value};
 use crate::codec::Message;
 use crate::limits::REPLY_BYTES_MAX;
 
@@ -18,7 +17,7 @@ pub struct Transition {
     /// As of this step.
     pub statistics: Statistics,
     /// 1 when the task is solved at this step, else 0.
-    #[serde(deserialize_with = "single::one")]
+    #[serde(deserialize_with = "strict::float")]
     pub reward: f32,
     /// The task itself ended the episode.
     pub terminated: bool,
@@ -56,6 +55,7 @@ pub enum Reply {
         transition: Transition,
         /// None: the image is whole. Else its `pixels` are those of these tiles of 16 x 16 pixels only, numbered row by
         /// row, one tile after the other; the others are as in the session's last observation ([`super::Image::complete`]).
+        #[serde(deserialize_with = "strict::optional")]
         changed_tiles: Option<Vec<u32>>,
         /// Microseconds that the simulator took for it: physics, picture and judge, without the wire.
         simulator_us: u32,
@@ -127,17 +127,6 @@ impl Reply {
 impl Message for Reply {
     const NAME: &'static str = "reply";
     const BYTES_MAX: usize = REPLY_BYTES_MAX;
-
-    fn bulk(&mut self) -> Option<&mut Bytes> {
-        match self {
-            Reply::Observed { observation, .. }
-            | Reply::Restored { observation, .. }
-            | Reply::Stepped { transition: Transition { observation, .. }, .. } => {
-                Some(&mut observation.image.pixels)
-            }
-            _ => None,
-        }
-    }
 
     fn validate(&self) -> Result<(), String> {
         value::sequence(

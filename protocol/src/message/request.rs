@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{single, value};
+use super::{strict, value};
 use crate::codec::Message;
 use crate::limits::{ACTION_DIMENSIONS_MAX, REQUEST_BYTES_MAX, SEED_END, SLOTS_MAX};
 
@@ -34,6 +34,7 @@ pub enum Request {
         /// `default`, or what is changed.
         variant: String,
         /// One of the fixed layouts; none draws a layout from the seed.
+        #[serde(deserialize_with = "strict::optional")]
         layout: Option<u32>,
         /// Below 2^53.
         seed: u64,
@@ -44,7 +45,7 @@ pub enum Request {
         sequence: u64,
         /// As the task's description says. In a Bridge task: translation in metres, rotation vector in radians,
         /// gripper +1 open or -1 closed; base frame.
-        #[serde(deserialize_with = "single::list")]
+        #[serde(deserialize_with = "strict::floats")]
         action: Vec<f32>,
     },
     /// Keeps the state in a slot until the next `Reset`. Answered with `Saved`.

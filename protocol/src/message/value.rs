@@ -1,12 +1,19 @@
 //! Checks of single values, worded once for every message.
 
+use crate::codec::first_value;
 use crate::limits::{ELEMENTS_MAX, NAME_BYTES_MAX, TEXT_BYTES_MAX};
 use crate::{PROTOCOL_VERSION, limits};
 
-/// A name: not empty, not long.
+/// A name: not empty, not long, and harmless in a terminal.
 pub fn name(field: &str, value: &str) -> Result<(), String> {
     if value.is_empty() || value.len() > NAME_BYTES_MAX {
         return Err(format!("{field}: expected 1 to {NAME_BYTES_MAX} bytes, got {}", value.len()));
+    }
+    if let Some(letter) = value.chars().find(|letter| letter.is_control()) {
+        return Err(format!(
+            "{field}: expected no control characters, got U+{:04X}",
+            letter as u32
+        ));
     }
     Ok(())
 }
@@ -94,8 +101,8 @@ pub fn recognise_protocol(bytes: &[u8]) -> Result<(), String> {
     struct Versioned {
         protocol: u32,
     }
-    match rmp_serde::from_slice::<Versioned>(bytes) {
-        Ok(versioned) => protocol(versioned.protocol),
+    match first_value::<Versioned>(bytes) {
+        Ok((versioned, _)) => protocol(versioned.protocol),
         // Not even a version: the strict decoder has better words for it.
         Err(_) => Ok(()),
     }

@@ -25,10 +25,6 @@ impl Message for VerifierUpdate {
     const NAME: &'static str = "verifier update";
     const BYTES_MAX: usize = VERIFIER_UPDATE_BYTES_MAX;
 
-    fn bulk(&mut self) -> Option<&mut Bytes> {
-        Some(&mut self.weights)
-    }
-
     fn validate(&self) -> Result<(), String> {
         value::name("name", &self.name)?;
         value::name("digest", &self.digest)?;

@@ -289,10 +289,10 @@ impl Supervisor {
         ServerProcess::spawn(
             &mut command,
             move |line| {
-                if let Some(server_id) = line.strip_prefix("ready ") {
-                    drop(
-                        lines.send(Event::Ready { start, server_id: server_id.trim().to_owned() }),
-                    );
+                // What it serves and where follows its id.
+                let offer = line.strip_prefix("ready ");
+                if let Some(server_id) = offer.and_then(|offer| offer.split_whitespace().next()) {
+                    drop(lines.send(Event::Ready { start, server_id: server_id.to_owned() }));
                 }
             },
             move || drop(ended.send(Event::Ended { start })),

@@ -2,8 +2,7 @@
 
 use std::time::Duration;
 
-use bytes::Bytes;
-use protocol::{Image, Open, Opening, Reply, Request, Reset, decode, decode_shared, encode};
+use protocol::{Image, Open, Opening, Reply, Request, Reset, decode, encode};
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use zenoh::bytes::ZBytes;
@@ -270,8 +269,7 @@ impl Environment {
 /// Reads a reply of a size that the protocol allows.
 fn read(payload: &ZBytes) -> Result<Reply, EnvironmentFault> {
     protocol::codec::check_size::<Reply>(payload.len()).map_err(EnvironmentFault::wire)?;
-    let bytes = Bytes::from(payload.to_bytes().into_owned());
-    decode_shared(&bytes).map_err(EnvironmentFault::wire)
+    decode(&payload.to_bytes()).map_err(EnvironmentFault::wire)
 }
 
 /// For a reply that does not belong to its request.

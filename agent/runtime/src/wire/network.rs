@@ -213,7 +213,10 @@ fn with_ports(endpoints: &[String]) -> anyhow::Result<Vec<String>> {
 fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Result<zenoh::Config> {
     let NetworkOptions { connect, multicast, .. } = options;
     let mut configuration = zenoh::Config::default();
-    for (key, value) in transport::settings(connect, listening, *multicast, CLIENT_WAIT_MS) {
+    let bytes_max = protocol::limits::MESSAGE_BYTES_MAX;
+    for (key, value) in
+        transport::settings(connect, listening, *multicast, CLIENT_WAIT_MS, bytes_max)
+    {
         configuration.insert_json5(key, &value).map_err(|error| {
             anyhow!("zenoh does not take {key} = {value}: {}", transport::in_words(error))
         })?;

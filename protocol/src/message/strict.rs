@@ -1,8 +1,8 @@
-//! 32-bit floats, alone and in lists: serde alone would narrow doubles and take integers.
+//! What serde alone would let pass: doubles and integers for 32-bit floats, and optional fields that are left out.
 
 use serde::de::{Deserialize, Deserializer, Error, Visitor};
 
-/// A float that was one on the wire.
+/// A float that had 32 bits on the wire.
 struct Single(f32);
 
 impl<'de> Deserialize<'de> for Single {
@@ -22,23 +22,30 @@ impl<'de> Deserialize<'de> for Single {
 }
 
 /// For `#[serde(deserialize_with)]` on `f32`.
-pub fn one<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
+pub fn float<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
     Single::deserialize(deserializer).map(|single| single.0)
 }
 
-/// For `#[serde(deserialize_with)]` on `Option<f32>`.
-pub fn maybe_one<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f32>, D::Error> {
-    Ok(Option::<Single>::deserialize(deserializer)?.map(|single| single.0))
-}
-
 /// For `#[serde(deserialize_with)]` on `Vec<f32>`.
-pub fn list<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f32>, D::Error> {
+pub fn floats<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f32>, D::Error> {
     let singles = Vec::<Single>::deserialize(deserializer)?;
     Ok(singles.into_iter().map(|single| single.0).collect())
 }
 
-/// For `#[serde(deserialize_with)]` on `Option<Vec<f32>>`.
-pub fn maybe_list<'de, D: Deserializer<'de>>(
+/// For `#[serde(deserialize_with)]` on an `Option` without floats: nil may stand there, but the field must.
+pub fn optional<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
+    deserializer: D,
+) -> Result<Option<T>, D::Error> {
+    Option::deserialize(deserializer)
+}
+
+/// The same on `Option<f32>`.
+pub fn optional_float<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f32>, D::Error> {
+    Ok(Option::<Single>::deserialize(deserializer)?.map(|single| single.0))
+}
+
+/// The same on `Option<Vec<f32>>`.
+pub fn optional_floats<'de, D: Deserializer<'de>>(
     deserializer: D,
 ) -> Result<Option<Vec<f32>>, D::Error> {
     let singles = Option::<Vec<Single>>::deserialize(deserializer)?;

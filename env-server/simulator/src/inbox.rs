@@ -1,0 +1,141 @@
+//! What waits for the simulation thread: bounded for each session, and taken from each in turn.
+//!
+//! zenoh's threads only put, and never wait. A session's own flood fills its own queue and nobody else's.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use protocol::{CodecError, Request, codec};
+use zenoh::bytes::ZBytes;
+use zenoh::query::Query;
+
+/// Requests of one session; its holder has one at a time and sends again what is dropped.
+const REQUESTS_MAX: usize = 4;
+/// Queries for all sessions together.
+const QUERIES_MAX: usize = 64;
+
+/// Something to do.
+pub enum Work {
+    /// A query on `describe`.
+    Describe(Query),
+    /// A query on `open`.
+    Open(Query),
+    /// A session's request, or why its bytes were not kept.
+    Request { session: String, bytes: Result<Vec<u8>, CodecError> },
+    /// A holder is gone.
+    HolderGone,
+}
+
+/// Shared with zenoh's threads.
+#[derive(Default)]
+pub struct Inbox {
+    waiting: Mutex<Waiting>,
+    arrived: Condvar,
+}
+
+#[derive(Default)]
+struct Waiting {
+    holder_gone: bool,
+    queries: VecDeque<Work>,
+    requests: HashMap<String, VecDeque<Result<Vec<u8>, CodecError>>>,
+    /// Each source that has something waiting, once.
+    turns: VecDeque<Source>,
+}
+
+enum Source {
+    Queries,
+    Session(String),
+}
+
+impl Inbox {
+    /// From now on the session's requests are kept.
+    pub fn admit(&self, session: &str) {
+        self.waiting().requests.insert(session.to_owned(), VecDeque::new());
+    }
+
+    /// They are no longer.
+    pub fn forget(&self, session: &str) {
+        self.waiting().requests.remove(session);
+    }
+
+    /// Copies a request, unless it is too large or too many wait.
+    pub fn put_request(&self, session: &str, payload: &ZBytes) {
+        let waiting = &mut *self.waiting();
+        let Some(requests) = waiting.requests.get_mut(session) else { return };
+        if requests.len() >= REQUESTS_MAX {
+            return;
+        }
+        let checked = codec::check_size::<Request>(payload.len());
+        requests.push_back(checked.map(|()| payload.to_bytes().into_owned()));
+        if requests.len() == 1 {
+            waiting.turns.push_back(Source::Session(session.to_owned()));
+        }
+        self.arrived.notify_one();
+    }
+
+    /// A query on `describe` or `open`; given back where too many wait.
+    pub fn put_query(&self, work: Work) -> Result<(), Work> {
+        let mut waiting = self.waiting();
+        if waiting.queries.len() >= QUERIES_MAX {
+            return Err(work);
+        }
+        waiting.queries.push_back(work);
+        if waiting.queries.len() == 1 {
+            waiting.turns.push_back(Source::Queries);
+        }
+        self.arrived.notify_one();
+        Ok(())
+    }
+
+    /// Some session's holder is gone.
+    pub fn put_holder_gone(&self) {
+        self.waiting().holder_gone = true;
+        self.arrived.notify_one();
+    }
+
+    /// What is next, waited for until `deadline`.
+    pub fn take(&self, deadline: Instant) -> Option<Work> {
+        let mut waiting = self.waiting();
+        loop {
+            if let Some(work) = waiting.next() {
+                return Some(work);
+            }
+            let left = deadline.checked_duration_since(Instant::now())?;
+            (waiting, _) =
+                self.arrived.wait_timeout(waiting, left).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    fn waiting(&self) -> MutexGuard<'_, Waiting> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Waiting {
+    fn next(&mut self) -> Option<Work> {
+        if std::mem::take(&mut self.holder_gone) {
+            return Some(Work::HolderGone);
+        }
+        loop {
+            match self.turns.pop_front()? {
+                Source::Queries => {
+                    let work = self.queries.pop_front();
+                    if !self.queries.is_empty() {
+                        self.turns.push_back(Source::Queries);
+                    }
+                    return work;
+                }
+                Source::Session(session) => {
+                    // One that has ended meanwhile has none.
+                    let Some(requests) = self.requests.get_mut(&session) else { continue };
+                    let Some(bytes) = requests.pop_front() else { continue };
+                    if !requests.is_empty() {
+                        self.turns.push_back(Source::Session(session.clone()));
+                    }
+                    return Some(Work::Request { session, bytes });
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! What leaves the server, sent by other threads than the simulation's: zenoh makes a sender wait for a peer that stops
+//! reading, up to a minute, and nobody else may wait with it.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
+
+use anyhow::{Context, Result};
+use bytes::Bytes;
+use zenoh::Wait;
+use zenoh::pubsub::Publisher;
+use zenoh::query::Query;
+
+/// Threads that answer queries at one time; almost always there is none.
+const ANSWERING_MAX: usize = 64;
+/// Queries that wait for their end unanswered: more than come before zenoh closes the link of a peer that stopped reading.
+const DISCARDED_MAX: usize = 16_384;
+
+/// A session's replies. Dropping it ends its thread after the last one.
+pub struct Outbox(Arc<Slot>);
+
+#[derive(Default)]
+struct Slot {
+    next: Mutex<Next>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct Next {
+    reply: Option<Bytes>,
+    has_ended: bool,
+}
+
+impl Outbox {
+    /// Starts the thread that sends by `publisher`.
+    pub fn new(publisher: Publisher<'static>) -> Result<Outbox> {
+        let slot = Arc::new(Slot::default());
+        let sent = Arc::clone(&slot);
+        let send = move || {
+            while let Some(reply) = sent.wait() {
+                if let Err(error) = publisher.put(reply).wait() {
+                    tracing::warn!("a reply was not sent: {error}");
+                }
+            }
+        };
+        thread::Builder::new()
+            .name("replies".to_owned())
+            .spawn(send)
+            .context("cannot start a thread")?;
+        Ok(Outbox(slot))
+    }
+
+    /// Sends a reply in the place of one that still waits: its holder asks again for what it misses.
+    pub fn send(&self, reply: Bytes) {
+        self.0.next().reply = Some(reply);
+        self.0.changed.notify_one();
+    }
+}
+
+impl Drop for Outbox {
+    fn drop(&mut self) {
+        self.0.next().has_ended = true;
+        self.0.changed.notify_one();
+    }
+}
+
+impl Slot {
+    /// The next reply; none after the last one.
+    fn wait(&self) -> Option<Bytes> {
+        let mut next = self.next();
+        loop {
+            if let Some(reply) = next.reply.take() {
+                return Some(reply);
+            }
+            if next.has_ended {
+                return None;
+            }
+            next = self.changed.wait(next).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    fn next(&self) -> MutexGuard<'_, Next> {
+        self.next.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Answers to queries. zenoh tells the asker of a query's end when it is dropped, which may wait, too.
+#[derive(Clone)]
+pub struct Answers {
+    answering: Arc<AtomicUsize>,
+    discarded: SyncSender<Query>,
+}
+
+impl Answers {
+    /// Starts the thread that ends queries unanswered.
+    pub fn new() -> Result<Answers> {
+        let (discarded, queries) = sync_channel(DISCARDED_MAX);
+        thread::Builder::new()
+            .name("discarded".to_owned())
+            .spawn(move || queries.iter().for_each(drop))
+            .context("cannot start a thread")?;
+        Ok(Answers { answering: Arc::default(), discarded })
+    }
+
+    /// Answers on a thread of its own; drops the query where too many answers wait for their readers.
+    pub fn send(&self, query: Query, key: String, bytes: Vec<u8>) {
+        if self.answering.fetch_add(1, Ordering::Relaxed) >= ANSWERING_MAX {
+            self.answering.fetch_sub(1, Ordering::Relaxed);
+            return self.discard(query);
+        }
+        let answering = Arc::clone(&self.answering);
+        let answer = move || {
+            if let Err(error) = query.reply(key, bytes).wait() {
+                tracing::warn!("a query was not answered: {error}");
+            }
+            drop(query);
+            answering.fetch_sub(1, Ordering::Relaxed);
+        };
+        if let Err(error) = thread::Builder::new().name("answer".to_owned()).spawn(answer) {
+            self.answering.fetch_sub(1, Ordering::Relaxed);
+            tracing::warn!("a query was not answered: cannot start a thread: {error}");
+        }
+    }
+
+    /// Ends a query unanswered without waiting.
+    pub fn discard(&self, query: Query) {
+        match self.discarded.try_send(query) {
+            Ok(()) => {}
+            // Nothing is left but to wait for the peer that reads none of so many ends.
+            Err(TrySendError::Full(query) | TrySendError::Disconnected(query)) => drop(query),
+        }
+    }
+}
