@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
+use std::net::{Ipv4Addr, TcpListener};
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
@@ -205,6 +206,41 @@ fn a_task_that_no_policy_fits_is_refused_in_words() {
             "expected a state of 8 and an action of 7 numbers, as the policy has, got 4 and 1";
         assert!(said.contains("task CartPole-v1") && said.contains(words), "{said}");
     });
+}
+
+#[test]
+fn what_one_client_does_wrong_costs_the_others_of_the_native_server_nothing() {
+    let mut pytest = python().command();
+    pytest
+        .current_dir(repository().join("env-server"))
+        .env("REVER_SIMULATOR", native().command().get_program())
+        .args(["-m", "pytest", "--quiet", "-k", "native", "tests/test_hostile_clients.py"]);
+    let said = succeed(&mut pytest);
+    assert!(said.contains("6 passed"), "{said}");
+}
+
+#[test]
+fn the_native_server_says_wrong_usage_in_a_line() {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("there is a free port");
+    let taken = listener.local_addr().expect("a bound listener has an address").to_string();
+    let taken = format!("tcp/{taken}");
+    let free = free_endpoint();
+    for (arguments, status, words) in [
+        (&[][..], 2, "--connect <ENDPOINT>|--listen <ENDPOINT>|--multicast"),
+        (&["--listen", &free, "--fleet", "../x"], 2, "cannot stand in a key"),
+        (&["--listen", &free, "--sessions", "0"], 2, "0 is not in 1..=256"),
+        (
+            &["--listen", &free, "--id-file", "/nowhere/id"],
+            1,
+            "expected it in a folder that exists",
+        ),
+        (&["--listen", &taken], 1, "Address already in use"),
+    ] {
+        let output = run(native().command().arg("serve").args(arguments));
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(status), "{arguments:?}: {said}");
+        assert!(said.contains(words) && !said.contains(".rs"), "{arguments:?}: {said}");
+    }
 }
 
 /// Of a server that is started with this command and the options that a test needs.
