@@ -178,6 +178,64 @@ def any_length() -> None:
         return original(self, np.resize(np.append(action, 0.0), 7))
 
 
+def never_opens() -> None:
+    kept = []
+
+    def open_(_self: Any, query: Any) -> Any:
+        kept.append(query)
+        raise Unanswered
+
+    Server._open = open_
+    ignore_unanswered()
+
+
+def never_steps() -> None:
+    @wrap(Session, "answer")
+    def answer(original: Any, self: Any, data: bytes) -> Any:
+        try:
+            request = protocol.REQUEST.decode(data)
+        except protocol.CodecError:
+            return original(self, data)
+        is_step = isinstance(request, protocol.Step)
+        return None if is_step else original(self, data)
+
+
+def describes_nonsense() -> None:
+    Server._describe = lambda self, query: b"nonsense"
+
+
+def answers_ahead() -> None:
+    @wrap(Server, "_answer")
+    def answer(original: Any, self: Any, lease: Any, request: Any) -> None:
+        original(self, lease, request)
+        last: Any = protocol.REPLY.decode(lease.session._last_reply)
+        if isinstance(last, protocol.Stepped):
+            transition = replace(last.transition, terminated=True)
+            ahead = replace(last, sequence=last.sequence + 1, transition=transition)
+            lease.outbox.send(protocol.REPLY.encode(ahead))
+
+
+class Unanswered(Exception):
+    """Stands for a reply that is never sent."""
+
+
+def ignore_unanswered() -> None:
+    @wrap(Server, "_queryable")
+    def queryable(original: Any, self: Any, key: str, answer: Any) -> Any:
+        def put_query(work: Callable[[], None]) -> bool:
+            def guarded() -> None:
+                try:
+                    work()
+                except Unanswered:
+                    pass
+
+            return bool(put(guarded))
+
+        put = self._inbox.put_query
+        self._inbox.put_query = put_query
+        return original(self, key, answer)
+
+
 DEFECTS = {
     function.__name__: function
     for function in (
@@ -200,6 +258,10 @@ DEFECTS = {
         any_length,
         breaks_first_reset,
         changes_world_first,
+        never_opens,
+        never_steps,
+        describes_nonsense,
+        answers_ahead,
     )
 }
 

@@ -17,7 +17,8 @@ mod containers;
 // The Python package's own tests.
 mod python;
 
-// The real client against real servers, on good wires and bad ones.
+// The real client against real servers, on good wires and bad ones; servers that do not keep to the protocol.
+mod bad_servers;
 mod wire;
 
 // The native simulator beside the Python one, and the test of servers.

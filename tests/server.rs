@@ -21,6 +21,19 @@ pub fn free_endpoint() -> String {
     format!("tcp/{}", listener.local_addr().expect("a bound listener has an address"))
 }
 
+/// A zenoh router in this process, as `zenohd` is one in its own.
+pub async fn open_router(endpoint: &str) -> zenoh::Session {
+    let mut configuration = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", "\"router\"".to_owned()),
+        ("listen/endpoints", format!("[\"{endpoint}\"]")),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ] {
+        configuration.insert_json5(key, &value).expect("a known setting");
+    }
+    zenoh::open(configuration).await.expect("the router listens")
+}
+
 impl Server {
     /// Starts a server that connects to `connect`, and waits until it says that it is ready.
     pub fn start(connect: &str, fleet: &str, arguments: &[&str]) -> Self {

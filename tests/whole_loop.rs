@@ -10,7 +10,7 @@ use store::record::EpisodeRecord;
 
 use crate::evaluation::{Evaluation, WAIT, is_alive, kill};
 use crate::harness::{python, rever, run, succeed, text, wait_for};
-use crate::server::{Server, free_endpoint};
+use crate::server::{Server, free_endpoint, open_router};
 
 /// One episode per task and strategy: the longest task lasts twice as long as the others, so that
 /// some episodes are recorded while others are still in the middle.
@@ -265,19 +265,6 @@ fn a_reset_that_breaks_is_repeated_and_another_simulator_is_left_out() {
     let said = evaluation.words();
     assert!(said.contains("expected the run's simulator") && said.contains("left out"), "{said}");
     runtime.block_on(async { router.close().await }).expect("the router closes");
-}
-
-/// A zenoh router in this process, as `zenohd` is one in its own.
-async fn open_router(endpoint: &str) -> zenoh::Session {
-    let mut configuration = zenoh::Config::default();
-    for (key, value) in [
-        ("mode", "\"router\"".to_owned()),
-        ("listen/endpoints", format!("[\"{endpoint}\"]")),
-        ("scouting/multicast/enabled", "false".to_owned()),
-    ] {
-        configuration.insert_json5(key, &value).expect("a known setting");
-    }
-    zenoh::open(configuration).await.expect("the router listens")
 }
 
 /// Same candidates, same choices, same outcomes; names of the runs and times differ.

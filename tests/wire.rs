@@ -15,7 +15,7 @@ use runtime::wire::{
 
 use crate::harness::repository;
 use crate::relay::{Badness, Relay};
-use crate::server::{Server, free_endpoint};
+use crate::server::{Server, free_endpoint, open_router};
 
 /// Longest wait for what takes a server a moment; a test machine may be busy.
 const WAIT: Duration = Duration::from_secs(60);
@@ -191,6 +191,33 @@ async fn a_stuck_simulation_times_out_though_its_token_stands() {
         panic!("expected to time out after 3 s, got {fault:?}")
     };
     relay.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_link_that_comes_back_costs_no_episode() {
+    let endpoint = free_endpoint();
+    let router = open_router(&endpoint).await;
+    let server = Server::start_behind_router(&endpoint, "restarted", &[]);
+    let options = NetworkOptions {
+        connect: vec![endpoint.clone()],
+        listen_here: false,
+        fleet: "restarted".into(),
+        ..NetworkOptions::default()
+    };
+    let network = Network::open(options).await.expect("the network opens");
+    assert_eq!(network.servers(1, WAIT).await.servers.len(), 1, "the server is found");
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let mut episode = environment.reset(spoon()).await.expect("an episode");
+    episode.step(&[0.0; 7]).await.expect("a step");
+    router.close().await.expect("the router goes");
+    let router = open_router(&endpoint).await;
+    let after = episode.step(&[0.0; 7]).await.expect("the same episode goes on");
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let mut undisturbed = environment.reset(spoon()).await.expect("an episode");
+    undisturbed.step(&[0.0; 7]).await.expect("a step");
+    let expected = undisturbed.step(&[0.0; 7]).await.expect("a step");
+    assert!(after == expected, "no step is done twice or left out");
+    router.close().await.expect("the router goes");
 }
 
 #[tokio::test(flavor = "multi_thread")]

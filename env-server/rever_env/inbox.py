@@ -34,7 +34,6 @@ class Inbox:
         self._changed = threading.Condition()
         self._turns: collections.deque[_Source] = collections.deque()
         self._queries = _Source(_QUERIES_MAX)
-        self._urgent = _Source(1)
 
     def session(self, answer: Callable[[bytes | protocol.TooLarge], None]) -> Callable[[Any], None]:
         """A callback for the samples of a session's requests.
@@ -59,14 +58,6 @@ class Inbox:
     def put_query(self, work: Work) -> bool:
         """Whether there was room."""
         return self._put(self._queries, work)
-
-    def put_urgent(self, work: Work) -> None:
-        """Before all else. Only the same may wait already, or it is dropped."""
-        with self._changed:
-            if not self._urgent.waiting:
-                self._urgent.waiting.append(work)
-                self._turns.appendleft(self._urgent)
-                self._changed.notify()
 
     def take(self, deadline: float) -> Work | None:
         """What is next, waited for until the deadline by the monotonic clock."""

@@ -29,7 +29,7 @@ from rever_env.worlds import UnknownTask, Worlds
 _log = logging.getLogger(__name__)
 
 _BEAT_SECS = 0.5
-_HOLDER_SECS_MAX = 10.0  # from opening a session to its holder's token
+_HOLDER_SECS_MAX = 10.0  # a session without its holder's token: the link may come back
 _CLOSED_SECS_MAX = 10.0  # a closed session still answers: its last reply may have been lost
 
 
@@ -57,12 +57,14 @@ class _Lease:
     declared: list[Any]
     closed_at: float | None = None
     holder: Literal["awaited", "alive", "gone"] = "awaited"
+    gone_at: float = 0.0
 
     def on_token(self, sample: Any) -> None:
         """The holder's liveliness token came or went."""
         if sample.kind == zenoh.SampleKind.PUT:
             self.holder = "alive"
         elif self.holder == "alive":
+            self.gone_at = time.monotonic()
             self.holder = "gone"
 
 
@@ -189,18 +191,13 @@ class Server:
         lease = _Lease(name, session, Outbox(publisher), time.monotonic(), [])
         self._leases[name] = lease
 
-        def on_token(sample: Any) -> None:
-            lease.on_token(sample)
-            if lease.holder == "gone":
-                self._inbox.put_urgent(self._end_gone)
-
         lease.declared = [
             self._network.declare_subscriber(
                 self._keys.request(name),
                 _direct(self._inbox.session(lambda request: self._answer(lease, request))),
             ),
             self._network.liveliness().declare_subscriber(
-                self._keys.session(name), _direct(on_token), history=True
+                self._keys.session(name), _direct(lease.on_token), history=True
             ),
         ]
         _log.info("session %s opened for %s", name, opened.holder)
@@ -218,17 +215,13 @@ class Server:
         if reply is not None:
             lease.outbox.send(reply)
 
-    def _end_gone(self) -> None:
-        for lease in list(self._leases.values()):
-            if lease.holder == "gone":
-                self._end(lease, None if lease.session.closed else "its holder is gone")
-
     def _end_abandoned(self, now: float) -> None:
-        self._end_gone()
         for lease in list(self._leases.values()):
             if lease.closed_at is not None:
-                if now - lease.closed_at > _CLOSED_SECS_MAX:
+                if lease.holder == "gone" or now - lease.closed_at > _CLOSED_SECS_MAX:
                     self._end(lease, None)
+            elif lease.holder == "gone" and now - lease.gone_at > _HOLDER_SECS_MAX:
+                self._end(lease, f"its holder has been gone for {_HOLDER_SECS_MAX:.0f} s")
             elif lease.holder == "awaited" and now - lease.opened_at > _HOLDER_SECS_MAX:
                 self._end(lease, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
 

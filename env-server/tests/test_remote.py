@@ -232,8 +232,10 @@ def test_a_session_that_the_server_ended_says_why_and_reset_opens_another(endpoi
     remote = rever_env.RemoteEnv(endpoint, SPOON, image_height=0, image_width=0)
     remote.reset(seed=1)
     remote.session._network._declared.pop().undeclare()  # the holder's token
-    with pytest.raises(RemoteFault, match="ended: its holder is gone"):
-        remote.step(STILL)
+    ends_at = time.monotonic() + 30.0
+    with pytest.raises(RemoteFault, match="ended: its holder has been gone for 10 s"):
+        while time.monotonic() < ends_at:
+            remote.session.ask(lambda sequence: protocol.Save(sequence, 0))
     with pytest.raises(RemoteFault, match="the session is lost, and reset opens a new one"):
         remote.step(STILL)
     remote.reset(seed=1)

@@ -23,8 +23,6 @@ pub enum Work {
     Open(Query),
     /// A session's request, or why its bytes were not kept.
     Request { session: String, bytes: Result<Vec<u8>, CodecError> },
-    /// A holder is gone.
-    HolderGone,
 }
 
 /// Shared with zenoh's threads.
@@ -36,7 +34,6 @@ pub struct Inbox {
 
 #[derive(Default)]
 struct Waiting {
-    holder_gone: bool,
     queries: VecDeque<Work>,
     requests: HashMap<String, VecDeque<Result<Vec<u8>, CodecError>>>,
     /// Each source that has something waiting, once.
@@ -88,12 +85,6 @@ impl Inbox {
         Ok(())
     }
 
-    /// Some session's holder is gone.
-    pub fn put_holder_gone(&self) {
-        self.waiting().holder_gone = true;
-        self.arrived.notify_one();
-    }
-
     /// What is next, waited for until `deadline`.
     pub fn take(&self, deadline: Instant) -> Option<Work> {
         let mut waiting = self.waiting();
@@ -114,9 +105,6 @@ impl Inbox {
 
 impl Waiting {
     fn next(&mut self) -> Option<Work> {
-        if std::mem::take(&mut self.holder_gone) {
-            return Some(Work::HolderGone);
-        }
         loop {
             match self.turns.pop_front()? {
                 Source::Queries => {

@@ -26,7 +26,7 @@ use crate::session::{Session, refused};
 use crate::worlds::Worlds;
 
 const BEAT: Duration = Duration::from_millis(500);
-/// From opening a session to its holder's token.
+/// A session without its holder's token: the link may come back.
 const HOLDER_WAIT_MAX: Duration = Duration::from_secs(10);
 /// A closed session still answers: its last reply may have been lost.
 const CLOSED_WAIT_MAX: Duration = Duration::from_secs(10);
@@ -69,7 +69,7 @@ struct Lease {
 enum Holder {
     Awaited,
     Alive,
-    Gone,
+    Gone(Instant),
 }
 
 impl<'a> Server<'a> {
@@ -149,7 +149,6 @@ impl<'a> Server<'a> {
                 self.answers.send(query, self.keys.open(&self.id)?, bytes);
             }
             Work::Request { session, bytes } => self.answer(&session, bytes),
-            Work::HolderGone => self.end_abandoned(Instant::now()),
         }
         Ok(())
     }
@@ -241,7 +240,6 @@ impl<'a> Server<'a> {
 
     /// Notes when the token of the session's holder comes and goes.
     fn watch(&self, name: &str, seen: Arc<Mutex<Holder>>) -> Result<Subscriber<()>> {
-        let inbox = Arc::clone(&self.inbox);
         self.network
             .liveliness()
             .declare_subscriber(self.keys.session(name)?)
@@ -250,12 +248,9 @@ impl<'a> Server<'a> {
                 let mut holder = locked(&seen);
                 *holder = match (sample.kind(), *holder) {
                     (SampleKind::Put, _) => Holder::Alive,
-                    (SampleKind::Delete, Holder::Alive) => Holder::Gone,
+                    (SampleKind::Delete, Holder::Alive) => Holder::Gone(Instant::now()),
                     (SampleKind::Delete, before) => before,
                 };
-                if *holder == Holder::Gone {
-                    inbox.put_holder_gone();
-                }
             })
             .wait()
             .map_err(in_words)
@@ -281,11 +276,15 @@ impl<'a> Server<'a> {
         for (name, lease) in &self.leases {
             let holder = *locked(&lease.holder);
             if let Some(closed_at) = lease.closed_at {
-                if since(closed_at) > CLOSED_WAIT_MAX || holder == Holder::Gone {
+                if since(closed_at) > CLOSED_WAIT_MAX || matches!(holder, Holder::Gone(_)) {
                     ended.push((name.clone(), None));
                 }
-            } else if holder == Holder::Gone {
-                ended.push((name.clone(), Some("its holder is gone".to_owned())));
+            } else if let Holder::Gone(gone_at) = holder {
+                if since(gone_at) > HOLDER_WAIT_MAX {
+                    let seconds = HOLDER_WAIT_MAX.as_secs();
+                    let reason = format!("its holder has been gone for {seconds} s");
+                    ended.push((name.clone(), Some(reason)));
+                }
             } else if holder == Holder::Awaited && since(lease.opened_at) > HOLDER_WAIT_MAX {
                 let seconds = HOLDER_WAIT_MAX.as_secs();
                 let reason = format!("expected its holder's token within {seconds} s");

@@ -1,0 +1,198 @@
+//! Servers that do not keep to the protocol cost their own episodes and nobody else's, and are named as what they are.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use decision::scripted::ScriptedPolicy;
+use decision::{Decider, Setting, Strategy, TaskId};
+use protocol::PROTOCOL_VERSION;
+use runtime::experiment::pool_options;
+use runtime::fault::EnvironmentFault;
+use runtime::rollout::{RecordOptions, Rollout};
+use runtime::sinks::{Event, EventSink, Sinks};
+use runtime::stop::Stop;
+use runtime::wire::{Environment, Network, NetworkOptions, Timing, ZenohPool};
+use store::plan::EpisodePlan;
+use store::queue::RunQueue;
+use store::record::Versions;
+use tokio::sync::watch;
+
+use crate::harness::{rever, run, text};
+use crate::server::{Server, free_endpoint, open_router};
+
+const EPISODES: u32 = 6;
+/// Longest wait for a run that takes seconds on a machine with nothing else to do.
+const WAIT: Duration = Duration::from_secs(120);
+
+/// Keeps the servers of recorded episodes and the reasons of faults.
+#[derive(Clone, Default)]
+struct Kept(Arc<Mutex<(Vec<String>, Vec<String>)>>);
+
+impl EventSink for Kept {
+    fn on(&mut self, event: &Event) -> Result<()> {
+        let mut kept = self.0.lock().expect("unpoisoned");
+        match event {
+            Event::Recorded(record) => kept.0.push(record.identity.id()),
+            Event::Faulted(fault) => kept.1.push(fault.reason.clone()),
+            Event::Started { .. } | Event::Stepped { .. } | Event::Notice(_) => {}
+        }
+        Ok(())
+    }
+}
+
+/// Runs episodes on a healthy server and one with a defect; the reasons of the faults on the way.
+async fn run_beside(fleet: &str, defect: &str, timing: Timing) -> (Vec<String>, Duration) {
+    let endpoint = free_endpoint();
+    let router = open_router(&endpoint).await;
+    let _broken = Server::start_broken_behind_router(&endpoint, fleet, defect);
+    let _healthy = Server::start_behind_router(&endpoint, fleet, &[]);
+    let options = NetworkOptions {
+        connect: vec![endpoint],
+        listen_here: false,
+        fleet: fleet.to_owned(),
+        timing,
+        ..NetworkOptions::default()
+    };
+    let network = Network::open(options).await.expect("the network opens");
+    let seen = network.fleet();
+    let mut both = seen.clone();
+    let both = both.wait_for(|fleet| fleet.servers.len() + fleet.undescribed.len() == 2);
+    tokio::time::timeout(WAIT, both).await.expect("both are seen").expect("the network is open");
+    let plan = |episode| EpisodePlan {
+        task: TaskId::default_of("widowx_spoon_on_towel"),
+        layout: None,
+        episode,
+        seed: 2_000_000_000 + u64::from(episode),
+        sampling_seed: 1,
+    };
+    let plans: Vec<EpisodePlan> = (0..EPISODES).map(plan).collect();
+    let setting = Setting { strategy: Strategy::Sample, candidates: 1, temperature: 1.0 };
+    let queue = RunQueue::new("run", &plans, &[setting], &BTreeSet::new());
+    let decider = Arc::new(Decider::new(Arc::new(ScriptedPolicy::new())));
+    let pool = pool_options(decider.policy().info(), "test".to_owned(), None);
+    let (_stop, stop) = watch::channel(Stop::No);
+    let (_scorer, scorer) = watch::channel(None);
+    let kept = Kept::default();
+    let rollout = Rollout {
+        decider,
+        scorer,
+        pool: ZenohPool::new(network.clone(), None, pool),
+        queue: Arc::new(queue),
+        sinks: Sinks::start(vec![Box::new(kept.clone())]).expect("a thread"),
+        sessions: 3,
+        options: RecordOptions::default(),
+        versions: versions(),
+        stop,
+    };
+    let begun = Instant::now();
+    tokio::time::timeout(WAIT, rollout.run()).await.expect("in time").expect("the run goes on");
+    let took = begun.elapsed();
+    network.close().await.expect("the network closes");
+    router.close().await.expect("the router closes");
+    let kept = kept.0.lock().expect("unpoisoned");
+    assert_eq!(kept.0.len(), EPISODES as usize, "every episode is recorded: {:?}", kept.1);
+    (kept.1.clone(), took)
+}
+
+fn versions() -> Versions {
+    Versions {
+        rever: "0.0.0".to_owned(),
+        commit: String::new(),
+        protocol: PROTOCOL_VERSION,
+        simulator: String::new(),
+        policy: String::new(),
+        verifier: None,
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_server_that_never_answers_open_holds_up_no_episode_of_others() {
+    let timing = Timing { open_max: Duration::from_secs(4), ..Timing::default() };
+    let (faults, _) = run_beside("never-opens", "never_opens", timing).await;
+    assert!(faults.is_empty(), "no episode had begun there: {faults:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_server_that_does_not_answer_a_step_costs_its_own_episodes() {
+    let timing = Timing { reply_max: Duration::from_secs(4), ..Timing::default() };
+    let (faults, _) = run_beside("never-steps", "never_steps", timing).await;
+    assert!(!faults.is_empty());
+    let is_named = |fault: &String| fault.contains("is alive but did not answer Step for 4 s");
+    assert!(faults.iter().all(is_named), "{faults:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_server_whose_episodes_do_not_end_is_held_to_its_description() {
+    let (faults, _) = run_beside("never-ends", "never_ends", Timing::default()).await;
+    assert!(!faults.is_empty());
+    let is_named = |fault: &String| fault.contains("to end after 60 steps");
+    assert!(faults.iter().all(is_named), "{faults:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_server_with_an_unreadable_description_is_left_out() {
+    let (faults, _) = run_beside("unreadable", "describes_nonsense", Timing::default()).await;
+    assert!(faults.is_empty(), "{faults:?}");
+}
+
+#[test]
+fn a_server_that_cannot_be_understood_is_named_as_what_it_is() {
+    let endpoint = free_endpoint();
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    let router = runtime.block_on(open_router(&endpoint));
+    let server = Server::start_broken_behind_router(&endpoint, "nonsense", "describes_nonsense");
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut evaluate = rever();
+    evaluate.current_dir(folder.path()).args(["evaluate", "--strategies=sample"]);
+    let output = run(evaluate.args(["--fleet=nonsense", &format!("--connect={endpoint}")]));
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("no environment server found"), "{said}");
+    assert!(said.contains(&format!("server {}", server.id)), "{said}");
+    assert!(said.contains("its description cannot be read"), "{said}");
+    runtime.block_on(async { router.close().await }).expect("the router closes");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_reply_that_precedes_its_request_is_refused() {
+    let endpoint = free_endpoint();
+    let router = open_router(&endpoint).await;
+    let server = Server::start_broken_behind_router(&endpoint, "ahead", "answers_ahead");
+    let options = NetworkOptions {
+        connect: vec![endpoint],
+        listen_here: false,
+        fleet: "ahead".to_owned(),
+        ..NetworkOptions::default()
+    };
+    let network = Network::open(options).await.expect("the network opens");
+    assert_eq!(network.servers(1, WAIT).await.servers.len(), 1);
+    let open = protocol::Open {
+        protocol: PROTOCOL_VERSION,
+        task: "widowx_spoon_on_towel".to_owned(),
+        variant: "default".to_owned(),
+        image_height: 0,
+        image_width: 0,
+        expert: false,
+        holder: "test".to_owned(),
+    };
+    let reset = protocol::Reset {
+        task: open.task.clone(),
+        variant: open.variant.clone(),
+        layout: None,
+        seed: 2_000_000_000,
+    };
+    let environment = Environment::open(&network, &server.id, open).await.expect("a session");
+    let mut episode = environment.reset(reset).await.expect("an episode");
+    // The reply to the first step may come before or after the one that is ahead of its request.
+    let fault = loop {
+        match episode.step(&[0.0; 7]).await {
+            Ok(transition) => assert!(!transition.terminated, "a forged reply was taken"),
+            Err(fault) => break fault,
+        }
+    };
+    let EnvironmentFault::Wire { reason } = &fault else { panic!("expected a fault, got {fault}") };
+    assert!(reason.contains("to come before its reply"), "{reason}");
+    router.close().await.expect("the router closes");
+}
