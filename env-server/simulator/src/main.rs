@@ -6,7 +6,6 @@
 //!     inbox, outbox       what waits for the simulation thread, and what it sends
 //!   worlds    idle worlds                        world     one task in MuJoCo: reset, step, save, restore
 //!     mjcf, model, controller, success, expert, layout, camera    tasks, assets   tasks.toml and the scenes
-//! surroundings   the environment's variables that choose a renderer
 //! ```
 
 mod assets;
@@ -23,7 +22,6 @@ mod server;
 mod serving;
 mod session;
 mod success;
-mod surroundings;
 mod tasks;
 mod trace;
 mod world;
@@ -60,10 +58,6 @@ fn main() -> ExitCode {
         unsafe { std::env::set_var(name, value) };
     }
     let program = Program::parse();
-    // SAFETY: no other thread runs yet that could read the environment.
-    for warning in unsafe { surroundings::isolate() } {
-        eprintln!("warning: {warning}");
-    }
     tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).init();
     match run(program) {
         Ok(()) => ExitCode::SUCCESS,
