@@ -1,6 +1,6 @@
 //! What zenoh's errors say once the places in its source are taken out.
 
-use protocol::transport::cause;
+use protocol::transport::in_words;
 
 #[test]
 fn an_error_keeps_its_cause_and_loses_the_paths_of_the_build() {
@@ -9,6 +9,6 @@ fn an_error_keeps_its_cause_and_loses_the_paths_of_the_build() {
                  /root/.cargo/registry/src/unicast.rs:338.";
     let expected = "Can not create a new TCP listener bound to tcp/127.0.0.1:1: [127.0.0.1:1: Address already in use \
                     (os error 98)]";
-    assert_eq!(cause(error), expected);
-    assert_eq!(cause("cannot listen at /tmp/socket"), "cannot listen at /tmp/socket");
+    assert_eq!(in_words(error), expected);
+    assert_eq!(in_words("cannot listen at /tmp/socket"), "cannot listen at /tmp/socket");
 }
