@@ -1,6 +1,5 @@
 """The camera: RGB images and visible-pixel masks from an offscreen OpenGL context."""
 
-import sys
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +16,6 @@ from rever_env.fault import RendererUnavailable
 Image = NDArray[np.uint8]
 _GEOMS_MAX = 200
 _HIDDEN_GROUP = 5  # of shapes; MuJoCo draws the groups 0 to 2
-_HAS_EGL = sys.platform == "linux"
 _EDGE_MARGIN = 1e-3  # metres, for rounding errors of OpenGL
 
 
@@ -40,7 +38,7 @@ class Camera:
 
     def _open(self, model: mujoco.MjModel, height: int, width: int) -> None:
         try:
-            context = opengl.Context() if _HAS_EGL else _PlatformContext(height, width)
+            context = opengl.Context() if opengl.HAS_EGL else _PlatformContext(height, width)
             with context.current():
                 renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
                 mujoco.mjr_resizeOffscreen(width, height, renderer)

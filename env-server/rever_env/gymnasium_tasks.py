@@ -35,12 +35,12 @@ class Making:
     wrapper: Any = None
 
     def make(self, name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":
-        """InvalidReset when there is no such environment or it does not take the arguments."""
+        """InvalidReset when there is no such environment, or when it cannot be made like that."""
         try:
             environment = gymnasium.make(name, **self.arguments, **arguments)
-        except (gymnasium.error.Error, ImportError, TypeError) as error:
-            raise InvalidReset(f"environment {name}: {error}") from error
-        return environment if self.wrapper is None else self.wrapper(environment)
+            return environment if self.wrapper is None else self.wrapper(environment)
+        except Exception as error:  # the environment's own code raises errors of any type
+            raise InvalidReset(f"environment {name}: {type(error).__name__}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def _task(name: str, making: Making, horizon: int, keys: Keys) -> GymnasiumTask:
             raise InvalidReset(f"environment {name}: expected actions of numbers, got none")
         try:
             observation, _ = environment.reset(seed=0)
-        except Exception as error:
+        except Exception as error:  # the same
             raise InvalidReset(
                 f"environment {name}: reset(seed=0) failed: {type(error).__name__}: {error}"
             ) from error

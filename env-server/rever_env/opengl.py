@@ -7,6 +7,7 @@ on every machine and in every process.
 import ctypes
 import json
 import os
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from rever_env.fault import RendererUnavailable
 
+HAS_EGL = sys.platform == "linux"  # elsewhere MuJoCo's own contexts are used
 _PACKAGES = "libegl1, libopengl0 and libgl1-mesa-dri"  # of Debian and Ubuntu
 _DEVICES_MAX = 16
 # Values of the EGL 1.5 headers.
@@ -89,7 +91,8 @@ def preserved_context() -> Iterator[None]:
 def unavailable() -> str | None:
     """The reason why this process cannot render images; None if it can."""
     try:
-        Context().free()
+        if HAS_EGL:
+            Context().free()
     except RendererUnavailable as error:
         return str(error)
     return None
@@ -100,6 +103,8 @@ def choose_device_for_other_libraries() -> None:
 
     They read the environment when they are imported or first draw.
     """
+    if not HAS_EGL:
+        return
     os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = "egl"
     with _lock:
         os.environ["MUJOCO_EGL_DEVICE_ID"] = str(_display().device)
@@ -110,6 +115,8 @@ def isolate_process() -> list[str]:
 
     For programs of rever_env, before OpenGL is loaded. Returns warnings for the user.
     """
+    if not HAS_EGL:
+        return []
     for name in (*_DRIVER_CHOICES, "MUJOCO_EGL_DEVICE_ID"):
         os.environ.pop(name, None)
     os.environ["LIBGL_ALWAYS_SOFTWARE"] = "1"

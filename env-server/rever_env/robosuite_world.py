@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rever_env import opengl
 from rever_env.expert import Decision
-from rever_env.fault import InvalidAction, PhysicsDiverged, RendererUnavailable
+from rever_env.fault import Fault, InvalidAction, PhysicsDiverged, RendererUnavailable
 from rever_env.layout import check_layout
 from rever_env.pose import in_base
 from rever_env.protocol import Statistics
@@ -47,20 +47,25 @@ class RobosuiteWorld:
         cameras = (
             {"camera_heights": image_height, "camera_widths": image_width} if has_image else {}
         )
-        with opengl.preserved_context():
-            self._environment: Any = robosuite.make(
-                **task.making,
-                has_renderer=False,
-                has_offscreen_renderer=has_image,
-                use_camera_obs=has_image,
-                camera_names=task.camera,
-                ignore_done=True,
-                # Some models are random, too (a cube's size): every world has the same one, since
-                # a new one at each reset would cost a second.
-                hard_reset=False,
-                seed=0,
-                **cameras,
-            )
+        try:
+            with opengl.preserved_context():
+                self._environment: Any = robosuite.make(
+                    **task.making,
+                    has_renderer=False,
+                    has_offscreen_renderer=has_image,
+                    use_camera_obs=has_image,
+                    camera_names=task.camera,
+                    ignore_done=True,
+                    # Some models are random, too (a cube's size): every world has the same one,
+                    # since a new one at each reset would cost a second.
+                    hard_reset=False,
+                    seed=0,
+                    **cameras,
+                )
+        except Exception as error:  # robosuite raises errors of any type
+            raise Fault(
+                f"robosuite cannot make {task.name}: {type(error).__name__}: {error}"
+            ) from error
         self._robot = self._environment.robots[0]
         if task.is_one_arm:
             arm = self._robot.part_controllers[self._robot.arms[0]]

@@ -149,7 +149,7 @@ class Session:
         self._running = False
         self._slots.clear()
         if self._world is not None:
-            self._world.close()
+            self._worlds.discard(self._world)
         self._world = self._key = None
         return protocol.REPLY.encode(protocol.Faulted(sequence, kind, _short(reason)))
 

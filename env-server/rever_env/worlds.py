@@ -1,5 +1,6 @@
 """A pool of the worlds of one process: created on demand, reused by sessions, limited."""
 
+import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sized
 from typing import Any, Protocol
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 
 from rever_env.protocol import Dimension, limits
 from rever_env.world import Observation, Transition, World
+
+_log = logging.getLogger(__name__)
 
 Key = tuple[str, str, int, int]
 Maker = Callable[[Any, int, int], "AnyWorld"]
@@ -113,9 +116,16 @@ class Worlds:
         """Keeps a world for reuse; closes the least recently used one beyond idle_max."""
         self._idle.append((key, world))
         if len(self._idle) > self._idle_max:
-            self._idle.popleft()[1].close()
+            self.discard(self._idle.popleft()[1])
+
+    def discard(self, world: AnyWorld) -> None:
+        """Closes a world for good. Another project's environment may fail even then."""
+        try:
+            world.close()
+        except Exception:
+            _log.exception("a world could not be closed")
 
     def close(self) -> None:
         """Closes the idle worlds."""
         while self._idle:
-            self._idle.pop()[1].close()
+            self.discard(self._idle.pop()[1])

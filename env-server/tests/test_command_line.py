@@ -11,7 +11,7 @@ import pytest
 def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
     """The package as a program."""
     return subprocess.run(
-        [sys.executable, "-m", "rever_env", *arguments], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "rever_env", *arguments], capture_output=True, text=True, timeout=300
     )
 
 

@@ -74,6 +74,20 @@ class Wide(Fickle):
     action_space: spaces.Space[Any] = spaces.Box(-1.0, 1.0, (200,))
 
 
+class Sealed(Fickle):
+    """Cannot be made or closed while it is broken."""
+
+    is_broken = False
+
+    def __init__(self) -> None:
+        if Sealed.is_broken:
+            raise OSError("no assets")
+
+    def close(self) -> None:
+        if Sealed.is_broken:
+            raise RuntimeError("stuck")
+
+
 def make(name: str, height: int, width: int, *imports: str) -> GymnasiumWorld:
     return GymnasiumWorld(offered([name], imports, Making(), 50)[name], height, width)
 
@@ -269,6 +283,26 @@ def test_an_environment_that_breaks_or_does_not_repeat_itself_is_a_fault() -> No
             world.step(np.array([0.0]))
     finally:
         del gymnasium.registry["rever-tests/Fickle-v0"]
+
+
+def test_an_environment_that_fails_when_it_is_made_or_closed_ends_no_server(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    gymnasium.register("rever-tests/Sealed-v0", entry_point=lambda **_: Sealed())
+    try:
+        tasks = offered(["rever-tests/Sealed-v0"], [], Making(), 50)
+        Sealed.is_broken = True
+        worlds = Worlds(tasks, 0, GymnasiumWorld)
+        key = ("rever-tests/Sealed-v0", "default", 0, 0)
+        with pytest.raises(InvalidReset, match="Sealed-v0: OSError: no assets"):
+            worlds.take(key)
+        Sealed.is_broken = False
+        world = worlds.take(key)
+        Sealed.is_broken = True
+        worlds.give_back(key, world)
+        assert "a world could not be closed" in caplog.text
+    finally:
+        del gymnasium.registry["rever-tests/Sealed-v0"]
 
 
 def test_physics_that_started_anew_is_a_fault() -> None:

@@ -38,7 +38,7 @@ def run(program: str, **variables: str) -> "subprocess.CompletedProcess[str]":
         env=kept | variables | {"PYTHONPATH": str(PACKAGE_ROOT)},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
     )
 
 
