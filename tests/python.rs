@@ -15,7 +15,9 @@ fn the_environment_server_passes_its_tests() {
 fn the_other_simulators_pass_their_tests() {
     let environment = simulators_environment(&installation(), Missing::Install)
         .expect("the simulators are set up");
-    pytest(&environment, &["tests/test_robosuite.py", "tests/test_gymnasium_world.py"]);
+    let files = ["test_robosuite", "test_motion", "test_gymnasium_world", "test_surroundings"];
+    let files = files.map(|name| format!("tests/{name}.py"));
+    pytest(&environment, &files.each_ref().map(String::as_str));
 }
 
 fn pytest(environment: &PythonEnvironment, files: &[&str]) {

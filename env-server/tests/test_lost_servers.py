@@ -10,19 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import end, free_endpoint, serve, served
+from conftest import end, free_endpoint, pause, serve, served
 
 import rever_env
 from rever_env import RemoteFault
 
 STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
 SMALL: dict[str, Any] = {"image_height": 8, "image_width": 8}
-
-
-def pause(process: "subprocess.Popen[str]") -> None:
-    """Stops a child and returns when it has stopped."""
-    os.kill(process.pid, signal.SIGSTOP)
-    os.waitpid(process.pid, os.WUNTRACED)
 
 
 def test_a_killed_server_is_named_and_found_again_by_reset() -> None:

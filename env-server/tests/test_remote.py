@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from conftest import free_endpoint, served
+from conftest import free_endpoint, pause, served
 from gymnasium.error import ClosedEnvironmentError
 from gymnasium.utils.env_checker import check_env
 
@@ -178,7 +178,7 @@ def test_who_is_not_there_is_told_within_seconds(endpoint: str, where: str, word
 def stopped_reply(process: "subprocess.Popen[str]", remote: Any, data: bytes) -> None:
     """Sends a step to a stopped server, and a reply to it in the server's place."""
     session = remote.session
-    os.kill(process.pid, signal.SIGSTOP)
+    pause(process)
     try:
         remote.send_step(STILL)
         session._network.zenoh.put(reply_key(remote), data)
