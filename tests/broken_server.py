@@ -219,7 +219,7 @@ def answers_ahead() -> None:
         if isinstance(last, protocol.Stepped):
             transition = replace(last.transition, terminated=True)
             ahead = replace(last, sequence=last.sequence + 1, transition=transition)
-            lease.outbox.send(protocol.REPLY.encode(ahead))
+            lease.outbox._publisher.put(protocol.REPLY.encode(ahead))
 
 
 class Unanswered(Exception):

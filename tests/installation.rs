@@ -174,7 +174,7 @@ fn too_little_memory_for_a_server_is_named() {
     let copied = Copied::new();
     let program = copied.command();
     let line = format!(
-        "ulimit -v 700000; exec {} doctor --python {}",
+        "ulimit -v 450000; exec {} doctor --python {}",
         Path::new(program.get_program()).display(),
         python().python.display()
     );

@@ -21,6 +21,9 @@ mod python;
 mod bad_servers;
 mod wire;
 
+// Outcomes for observers, verifiers for followers.
+mod published;
+
 // The native simulator beside the Python one, and the test of servers.
 mod simulators;
 

@@ -43,6 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="control steps of episodes of robosuite's own tasks and of Gymnasium ids without a "
         f"limit (default: {_HORIZON})",
     )
+    _add_robosuite_arguments(parser)
+    _add_gymnasium_arguments(parser)
+
+
+def _add_robosuite_arguments(parser: argparse.ArgumentParser) -> None:
     robosuite = parser.add_argument_group("options of --robosuite, for its own tasks")
     robosuite.add_argument(
         "--robots",
@@ -57,6 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="HZ",
         help=f"control steps per second (default: {_CONTROL_HZ:g})",
     )
+
+
+def _add_gymnasium_arguments(parser: argparse.ArgumentParser) -> None:
     gymnasium = parser.add_argument_group("options of --gymnasium")
     gymnasium.add_argument(
         "--import",

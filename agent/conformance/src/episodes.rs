@@ -58,16 +58,7 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
             simulator_time(subject),
         )
         .await;
-    table
-        .row("seeds", "another seed gives another layout", async {
-            let mut talk = subject.talk().await?;
-            let first = talk.reset(0).await?;
-            let second = talk.reset(1).await?;
-            talk.close().await?;
-            ensure!(first != second, "expected another observation with another seed");
-            Ok(Tested::Kept)
-        })
-        .await;
+    table.row("seeds", "another seed gives another layout", seeds(subject)).await;
     table
         .row("save", "Save and Restore are bit-exact; Reset empties the slots", save(subject))
         .await;
@@ -81,6 +72,15 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
             horizon(subject),
         )
         .await;
+}
+
+async fn seeds(subject: &Subject<'_>) -> Result<Tested> {
+    let mut talk = subject.talk().await?;
+    let first = talk.reset(0).await?;
+    let second = talk.reset(1).await?;
+    talk.close().await?;
+    ensure!(first != second, "expected another observation with another seed");
+    Ok(Tested::Kept)
 }
 
 async fn observation(subject: &Subject<'_>) -> Result<Tested> {

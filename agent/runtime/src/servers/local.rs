@@ -118,5 +118,4 @@ pub(super) fn lock(state: &Mutex<State>) -> MutexGuard<'_, State> {
 }
 
 #[cfg(test)]
-#[path = "local_tests.rs"]
 mod tests;

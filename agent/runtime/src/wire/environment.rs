@@ -253,16 +253,23 @@ impl Environment {
     /// time for which a server keeps a session costs nothing but that time.
     async fn await_return(&mut self) -> Result<(), EnvironmentFault> {
         let server = self.server.clone();
-        if !self.network.is_remote() || self.network.is_connected().await {
+        if !self.network.is_remote() {
             return Err(EnvironmentFault::ServerLost { server });
         }
         let returned = self.status.wait_for(|status| status.alive);
-        match tokio::time::timeout(self.timing.link_max, returned).await {
-            Ok(Ok(status)) => self.losses = status.losses,
-            Ok(Err(_)) => return Err(EnvironmentFault::wire("the network is closed")),
-            Err(_) => return Err(EnvironmentFault::LinkLost { server }),
+        let returned = tokio::time::timeout(self.timing.link_max, returned).await;
+        // What guards the status must not be held over the next wait.
+        match returned.map(|status| status.map(|status| status.losses)) {
+            Ok(Ok(losses)) => {
+                self.losses = losses;
+                Ok(())
+            }
+            Ok(Err(_)) => Err(EnvironmentFault::wire("the network is closed")),
+            Err(_) if self.network.is_connected().await => {
+                Err(EnvironmentFault::ServerLost { server })
+            }
+            Err(_) => Err(EnvironmentFault::LinkLost { server }),
         }
-        Ok(())
     }
 }
 
