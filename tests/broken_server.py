@@ -7,11 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from rever_env import __main__, protocol, server, session, world
+from rever_env import __main__, protocol, server, session, world, worlds
 
 Session: Any = session.Session
 Server: Any = server.Server
 World: Any = world.World
+Worlds: Any = worlds.Worlds
 
 
 def wrap(kind: Any, name: str) -> Callable[[Callable[..., Any]], None]:
@@ -77,6 +78,12 @@ def changes_world_first() -> None:
         self._release()
         self._world, self._key = self._worlds.take(key), key
         return self._world.reset(layout=request.layout, seed=request.seed)
+
+
+def any_variant() -> None:
+    @wrap(Worlds, "task")
+    def task(original: Any, self: Any, name: str, _variant: str) -> Any:
+        return original(self, name, "default")
 
 
 def one_seed() -> None:
@@ -185,6 +192,7 @@ DEFECTS = {
         answers_older,
         jumps_gaps,
         drifts,
+        any_variant,
         one_seed,
         forgets_command,
         never_ends,

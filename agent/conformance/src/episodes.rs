@@ -2,8 +2,8 @@
 
 use std::time::Instant;
 
-use anyhow::{Result, bail, ensure};
-use protocol::{Open, Reply, Request, TaskDescription, Transition, decode};
+use anyhow::{Context, Result, bail, ensure};
+use protocol::{Observation, Open, Reply, Request, TaskDescription, Transition, decode};
 
 use super::subject::{Subject, Talk, names};
 use super::{Table, Tested};
@@ -33,8 +33,15 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row(
             "reset_task",
-            "a Reset to a task or a layout that is not offered is refused",
+            "a Reset to a task, a variant or a layout that is not offered is refused",
             reset_task(subject),
+        )
+        .await;
+    table
+        .row(
+            "tasks",
+            "every task in every variant can be reset, with the instruction and the state described",
+            tasks(subject),
         )
         .await;
     table
@@ -86,37 +93,52 @@ async fn observation(subject: &Subject<'_>) -> Result<Tested> {
         (rows, columns) == (height as usize, width as usize),
         "expected an image of {height} x {width}, got {rows} x {columns}"
     );
-    ensure!(
-        seen.state.len() == subject.task().state.len(),
-        "expected a state of {} numbers, as described, got {}",
-        subject.task().state.len(),
-        seen.state.len()
-    );
+    as_described(subject.task(), &seen)?;
     ensure!(seen.expert_action.is_none(), "expected no expert's action, got one");
-    ensure!(
-        seen.instruction == subject.task().instruction || subject.task().instruction.is_empty(),
-        "expected the instruction {:?}, got {:?}",
-        subject.task().instruction,
-        seen.instruction
-    );
     talk.close().await?;
     Ok(Tested::Kept)
 }
 
+async fn tasks(subject: &Subject<'_>) -> Result<Tested> {
+    // Without images, which some servers are slow to set up.
+    let open = Open { image_height: 0, image_width: 0, ..subject.open() };
+    let mut talk = subject.talk_with(&open).await?;
+    for task in &subject.description.tasks {
+        talk.task = task.clone();
+        let seen = talk.reset(0).await;
+        seen.and_then(|seen| as_described(task, &seen))
+            .with_context(|| format!("task {} in its variant {}", task.task, task.variant))?;
+    }
+    talk.close().await?;
+    Ok(Tested::Kept)
+}
+
+fn as_described(task: &TaskDescription, seen: &Observation) -> Result<()> {
+    ensure!(
+        seen.state.len() == task.state.len(),
+        "expected a state of {} numbers, as described, got {}",
+        task.state.len(),
+        seen.state.len()
+    );
+    ensure!(
+        seen.instruction == task.instruction || task.instruction.is_empty(),
+        "expected the instruction {:?}, got {:?}",
+        task.instruction,
+        seen.instruction
+    );
+    Ok(())
+}
+
 async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
     let mut talk = subject.episode(0).await?;
-    let variant = subject.task().variant.clone();
-    let reason = talk
-        .refused(|sequence| Request::Reset {
-            sequence,
-            task: "no_such_task".to_owned(),
-            variant,
-            layout: None,
-            seed: 0,
-        })
-        .await?;
-    names(&reason, &["no_such_task"])?;
-    let beyond = subject.task().layouts;
+    let own = subject.task();
+    for (task, variant) in [("no_such_task", &*own.variant), (&*own.task, "no_such_variant")] {
+        let (task, variant) = (task.to_owned(), variant.to_owned());
+        let wanted = [task.clone(), variant.clone()];
+        let reset = |sequence| Request::Reset { sequence, task, variant, layout: None, seed: 0 };
+        names(&talk.refused(reset).await?, &wanted.each_ref().map(String::as_str))?;
+    }
+    let beyond = own.layouts;
     let request = talk.resetting(Some(beyond), 0);
     names(&talk.refused(request).await?, &["layout", &beyond.to_string()])?;
     // Refused: the world is unchanged, and the episode goes on.
@@ -126,13 +148,16 @@ async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
     talk.restore(0).await?;
     let expected = stepped(talk.go().await?);
     talk.restore(0).await?;
-    let mut others = subject.description.tasks.iter();
-    if let Some(other) = others.find(|other| other.task != subject.task().task) {
+    let offered = &subject.description.tasks;
+    let other_task = offered.iter().find(|other| other.task != own.task);
+    let mut variants = offered.iter().filter(|other| other.task == own.task);
+    let other_variant = variants.find(|other| other.variant != own.variant);
+    for other in other_task.into_iter().chain(other_variant) {
         let TaskDescription { task, variant, layouts, .. } = other.clone();
         let layout = Some(layouts);
         let reset = |sequence| Request::Reset { sequence, task, variant, layout, seed: 0 };
         names(&talk.refused(reset).await?, &["layout"])?;
-        equal(&[expected], &[stepped(talk.go().await?)])?;
+        equal(std::slice::from_ref(&expected), &[stepped(talk.go().await?)])?;
         talk.restore(0).await?;
     }
     talk.close().await?;

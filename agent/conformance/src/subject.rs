@@ -37,7 +37,8 @@ pub struct Subject<'a> {
 /// A session whose requests are numbered as they should be.
 pub struct Talk {
     pub probe: Probe,
-    task: TaskDescription,
+    /// What `reset` and `resetting` ask for.
+    pub task: TaskDescription,
     still: Vec<f32>,
     moving: Vec<f32>,
     /// Of the last request.
