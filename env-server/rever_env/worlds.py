@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rever_env.protocol import Dimension, limits
+from rever_env.tasks import TaskId
 from rever_env.world import Observation, Transition, World
 
 _log = logging.getLogger(__name__)
@@ -99,8 +100,8 @@ class Worlds:
         """The task; UnknownTask when it is not offered."""
         task = self.tasks.get((name, variant))
         if task is None:
-            offered = ", ".join(f"{name} ({variant})" for name, variant in self.tasks)
-            raise UnknownTask(f"expected one of the tasks {offered}, got {name} ({variant})")
+            offered = ", ".join(str(TaskId(*known)) for known in self.tasks)
+            raise UnknownTask(f"task {TaskId(name, variant)}: expected one of {offered}")
         return task
 
     def take(self, key: Key) -> AnyWorld:

@@ -21,6 +21,7 @@ from rever_env.protocol import tiles
 from rever_env.server import Server, ServerOptions
 from rever_env.serving import Endpoints
 from rever_env.session import Session
+from rever_env.tasks import TaskId
 from rever_env.worlds import UnknownTask, Worlds
 
 SPOON = "widowx_spoon_on_towel"
@@ -269,9 +270,23 @@ def first_line(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline()
 
 
-def test_a_server_describes_itself_and_ends_on_a_signal() -> None:
+@pytest.mark.parametrize(
+    ("names", "offered"),
+    [
+        ([], [str(task.id) for task in tasks.load().values()]),
+        (
+            ["widowx_stack_cube", "widowx_carrot_on_plate/all"],
+            ["widowx_carrot_on_plate", "widowx_carrot_on_plate/size-0.5", "widowx_stack_cube"],
+        ),
+    ],
+    ids=["all", "some"],
+)
+def test_a_server_describes_itself_and_ends_on_a_signal(
+    names: list[str], offered: list[str]
+) -> None:
     endpoint = free_endpoint()
-    with serve(endpoint, "--sessions", "3", "--fleet", "home") as process:
+    chosen = ["--tasks", *names] if names else []
+    with serve(endpoint, "--sessions", "3", "--fleet", "home", *chosen) as process:
         ready = first_line(process)
         assert ready.startswith("ready ")
         name = ready.split()[1]
@@ -280,8 +295,8 @@ def test_a_server_describes_itself_and_ends_on_a_signal() -> None:
             for reply in network.get(protocol.Keys("home").describe(name), timeout=WAIT_SECS):
                 description = protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes())
         assert (description.server, description.sessions_max) == (name, 3)
-        offered = {(task.task, task.variant) for task in description.tasks}
-        assert offered == {task.id for task in tasks.load().values()}
+        described = [str(TaskId(task.task, task.variant)) for task in description.tasks]
+        assert described == offered
         process.send_signal(signal.SIGTERM)
         assert process.wait(WAIT_SECS) == 0
 

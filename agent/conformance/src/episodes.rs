@@ -132,11 +132,14 @@ fn as_described(task: &TaskDescription, seen: &Observation) -> Result<()> {
 async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
     let mut talk = subject.episode(0).await?;
     let own = subject.task();
-    for (task, variant) in [("no_such_task", &*own.variant), (&*own.task, "no_such_variant")] {
+    let (strange_task, strange_variant) = ("no_such_task", "no_such_variant");
+    for (task, variant, strange) in [
+        (strange_task, &*own.variant, strange_task),
+        (&*own.task, strange_variant, strange_variant),
+    ] {
         let (task, variant) = (task.to_owned(), variant.to_owned());
-        let wanted = [task.clone(), variant.clone()];
         let reset = |sequence| Request::Reset { sequence, task, variant, layout: None, seed: 0 };
-        names(&talk.refused(reset).await?, &wanted.each_ref().map(String::as_str))?;
+        names(&talk.refused(reset).await?, &[strange])?;
     }
     let beyond = own.layouts;
     let request = talk.resetting(Some(beyond), 0);

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use crate::fault::Fault;
-use crate::tasks::Task;
+use crate::tasks::{Task, TaskId};
 use crate::world::World;
 
 /// Which worlds are alike.
@@ -40,14 +40,10 @@ impl Worlds {
 
     /// The task; refused when it is not offered.
     pub fn task(&self, name: &str, variant: &str) -> Result<&Arc<Task>, Fault> {
-        let wanted = |task: &&Arc<Task>| task.id.task == name && task.id.variant == variant;
-        self.tasks.iter().find(wanted).ok_or_else(|| {
-            let words = |task: &Arc<Task>| format!("{} ({})", task.id.task, task.id.variant);
-            let offered: Vec<String> = self.tasks.iter().map(words).collect();
-            Fault::Wrong(format!(
-                "expected one of the tasks {}, got {name} ({variant})",
-                offered.join(", ")
-            ))
+        let wanted = TaskId { task: name.to_owned(), variant: variant.to_owned() };
+        self.tasks.iter().find(|task| task.id == wanted).ok_or_else(|| {
+            let offered: Vec<String> = self.tasks.iter().map(|task| task.id.to_string()).collect();
+            Fault::Wrong(format!("task {wanted}: expected one of {}", offered.join(", ")))
         })
     }
 
