@@ -179,10 +179,12 @@ def test_a_closed_session_repeats_its_last_reply_and_does_nothing_else(session: 
 
 def test_unknown_tasks_and_placements_are_refused(session: Session, worlds: Worlds) -> None:
     reply = ask(session, protocol.Reset(3, "widowx_fold_towel", "default", None, 7))
-    check_refused(reply, 3, "got widowx_fold_towel (default)")
-    reply = ask(session, protocol.Reset(4, SPOON, "default", 24, 7))
+    check_refused(reply, 3, "task widowx_fold_towel: expected one of widowx_spoon_on_towel, ")
+    reply = ask(session, protocol.Reset(4, SPOON, "upside-down", None, 7))
+    check_refused(reply, 4, f"task {SPOON}/upside-down: expected one of {SPOON}, {SPOON}/paraph")
+    reply = ask(session, protocol.Reset(5, SPOON, "default", 24, 7))
     assert isinstance(reply, protocol.Refused)
-    with pytest.raises(UnknownTask, match="got widowx_fold_towel"):
+    with pytest.raises(UnknownTask, match="task widowx_fold_towel: expected"):
         Session(
             protocol.Open(
                 protocol.PROTOCOL_VERSION, "widowx_fold_towel", "default", 64, 64, False, "test"
