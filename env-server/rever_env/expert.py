@@ -21,7 +21,7 @@ TURN_MAX = 0.25  # rad per step
 SLOPE = 3.0  # metres of height allowed per metre of horizontal error: a funnel over the goal
 REACH_TOLERANCE = 0.005  # metres, horizontal, to begin the last descent
 CLOSE_TOLERANCE = 0.008  # to close an open gripper
-KEEP_CLOSING_TOLERANCE = 0.015  # to go on closing one that is visibly closing
+KEEP_CLOSING_TOLERANCE = 0.015  # to continue closing one that is visibly closing
 RISE_WHILE_CLOSING = 0.006  # metres per step, once the fingers are visibly on their way
 RISEN_MAX = 0.025  # metres above the grasp at which closed fingers have missed
 PLACE_TOLERANCE = 0.006
@@ -32,7 +32,7 @@ OPEN_MIN = 0.034  # finger joint position that counts as open, metres
 
 
 class Stage(Protocol):
-    """A running episode in MuJoCo, whoever steps it; task has the names of its model."""
+    """A running episode in MuJoCo, in any simulator; task has the names of its model."""
 
     @property
     def model(self) -> mujoco.MjModel: ...

@@ -39,7 +39,7 @@ class Touch:
 
 
 def success_alone(is_success: bool, ever_success: bool) -> Statistics:
-    """Statistics of worlds that know nothing else of an episode."""
+    """Statistics of environments that report success and nothing else."""
     return Statistics(
         is_success=is_success,
         is_grasped=False,
@@ -54,7 +54,7 @@ def success_alone(is_success: bool, ever_success: bool) -> Statistics:
 
 
 class Judge:
-    """Reads contacts and poses and says what the episode has come to."""
+    """Judges an episode by contacts and poses."""
 
     def __init__(self, model: mujoco.MjModel, task: Task) -> None:
         self._model = model
@@ -126,7 +126,7 @@ class Judge:
                 kind = "target" if other == self._target else "elsewhere"
             is_finger = other in self._fingers
             if kind in touched and not is_finger:
-                continue  # what rests on the table touches it in many points, and one tells
+                continue  # an object on the table touches it in many points; one is enough
             mujoco.mj_contactForce(self._model, data, index, wrench)
             if norm(wrench[:3]) * self._task.settings.timestep < self._task.grasp.impulse_min:
                 continue

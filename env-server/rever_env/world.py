@@ -1,4 +1,4 @@
-"""The world of one task: reset, step, save, restore, render."""
+"""The simulated environment of one task: reset, step, save, restore, render."""
 
 from dataclasses import dataclass
 from types import TracebackType
@@ -36,8 +36,8 @@ __all__ = [
 ]
 
 _START_GAP = 0.002  # objects start this far above rest, metres
-# m/s or rad/s: beyond this the physics is broken, not fast. What falls off the table lands on an
-# edge and spins at more than 100 rad/s.
+# m/s or rad/s: beyond this the physics has diverged. An object that falls off the table and lands
+# on an edge spins at more than 100 rad/s.
 _SPEED_MAX = 1000.0
 _DIVERGENCE = {
     int(warning): warning.name
@@ -47,7 +47,7 @@ _DIVERGENCE = {
         mujoco.mjtWarning.mjWARN_BADQACC,
     )
 }
-# MuJoCo's marks of a kinematic tree that has moved just now, and of one that has long been still.
+# MuJoCo's values for a kinematic tree that has just moved, and for one that may sleep.
 _AWAKE, _READY_TO_SLEEP = -(1 + mujoco.mjMINAWAKE), -1
 # Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
 DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -184,11 +184,11 @@ class World:
 
     def _running(self) -> Memory:
         if self.memory is None:
-            raise InvalidAction("step, save or expert before reset: expected a reset world")
+            raise InvalidAction("step, save or expert action before reset: expected a reset first")
         return self.memory
 
     def _settle(self) -> None:
-        """Lets the objects come to rest, as SIMPLER does after its drop (which is left out)."""
+        """Lets the objects come to rest, as SIMPLER does; its drop before that is left out."""
         settings = self.task.settings
         steps = round(settings.settle / settings.timestep)
         mujoco.mj_step(self.model, self.data, steps)
@@ -221,22 +221,23 @@ class World:
     def _forward(self) -> None:
         """Poses and contacts of this moment: mj_step leaves them one physics step old.
 
-        What sleeps is woken, for contacts of sleeping objects are left out and the judge needs
-        them, and goes back to sleep with the next physics step. That follows from the velocities
-        alone, and the warm start is put back: going on from here equals going on from a restore.
+        Sleeping objects are woken, because MuJoCo leaves their contacts out and the judge needs
+        them; they sleep again after the next physics step. Which ones follows from the velocities
+        alone, and the warm start is kept, so that continuing from here equals continuing after a
+        restore.
         """
         data = self.data
         warm_start = data.qacc_warmstart.copy()
         asleep = np.maximum.reduceat(np.abs(data.qvel), self.model.tree_dofadr) == 0.0  # (trees,)
         resting = asleep[self.model.dof_treeid]
-        data.qvel[resting] = -0.0  # what MuJoCo wakes and nothing else
+        data.qvel[resting] = -0.0  # wakes them in MuJoCo and changes nothing else
         mujoco.mj_forward(self.model, data)
         data.qvel[resting] = 0.0
         data.tree_asleep[:] = np.where(asleep, _READY_TO_SLEEP, _AWAKE)
         data.qacc_warmstart[:] = warm_start
 
     def _refresh(self) -> None:
-        """Brings poses and contacts up to date, and looks whether the physics is still sound."""
+        """Updates poses and contacts, and checks that the physics has not diverged."""
         self._forward()
         words = broken(self.model, self.data)
         if words:
@@ -260,7 +261,7 @@ class World:
 
 
 def broken(model: mujoco.MjModel, data: mujoco.MjData) -> str:
-    """Why the physics is not sound, or nothing if it is."""
+    """Why the physics counts as diverged; empty if it does not."""
     speeds = np.abs(data.qvel)
     fastest = int(speeds.argmax())
     speed = float(speeds[fastest])

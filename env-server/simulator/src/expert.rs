@@ -1,4 +1,4 @@
-//! The scripted expert, without its reasons: what the server reports to those who opened a session with `expert`.
+//! The scripted expert, without its reasons: the server reports its actions in sessions opened with `expert`.
 //!
 //! It picks the source and puts it on the target, from the visible state alone, as `rever_env/expert.py` does.
 
@@ -20,7 +20,7 @@ const SLOPE: f64 = 3.0;
 const REACH_TOLERANCE: f64 = 0.005;
 /// To close an open gripper.
 const CLOSE_TOLERANCE: f64 = 0.008;
-/// To go on closing one that is visibly closing.
+/// To continue closing one that is visibly closing.
 const KEEP_CLOSING_TOLERANCE: f64 = 0.015;
 /// Metres per step, once the fingers are visibly on their way.
 const RISE_WHILE_CLOSING: f64 = 0.006;

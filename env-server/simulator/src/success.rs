@@ -33,7 +33,7 @@ pub struct Touch {
     elsewhere: bool,
 }
 
-/// Reads contacts and poses and says what the episode has come to.
+/// Judges an episode by contacts and poses.
 pub struct Judge {
     task: Arc<Task>,
     names: Names,

@@ -1,4 +1,4 @@
-//! The world of one task: reset, step, save, restore, render.
+//! The simulated environment of one task: reset, step, save, restore, render.
 
 use std::sync::{Arc, Once};
 
@@ -18,10 +18,10 @@ use crate::tasks::{ACTION_LENGTH, Layout, STATE_LENGTH, Task};
 
 /// Objects start this far above rest, metres.
 const START_GAP: f64 = 0.002;
-/// m/s or rad/s: beyond this the physics is broken, not fast. What falls off the table lands on an
-/// edge and spins at more than 100 rad/s.
+/// m/s or rad/s: beyond this the physics has diverged. An object that falls off the table and lands
+/// on an edge spins at more than 100 rad/s.
 const SPEED_MAX: f64 = 1000.0;
-/// MuJoCo's marks of a kinematic tree that has moved just now, and of one that has long been still.
+/// MuJoCo's values for a kinematic tree that has just moved, and for one that may sleep.
 const AWAKE: i32 = -1 - mjMINAWAKE as i32;
 const READY_TO_SLEEP: i32 = -1;
 /// Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
@@ -174,7 +174,9 @@ impl World {
 
     fn running(&self) -> Result<&Episode, Fault> {
         self.episode.as_ref().ok_or_else(|| {
-            Fault::Wrong("step, save or expert before reset: expected a reset world".to_owned())
+            Fault::Wrong(
+                "step, save or expert action before reset: expected a reset first".to_owned(),
+            )
         })
     }
 
@@ -208,7 +210,7 @@ impl World {
         }
     }
 
-    /// Lets the objects come to rest, as SIMPLER does after its drop (which is left out).
+    /// Lets the objects come to rest, as SIMPLER does; its drop before that is left out.
     fn settle(&mut self) -> Result<(), Fault> {
         let task = Arc::clone(&self.task);
         let settings = &task.settings;
@@ -263,9 +265,9 @@ impl World {
 
     /// Poses and contacts of this moment: a physics step leaves them one step old.
     ///
-    /// What sleeps is woken, for contacts of sleeping objects are left out and the judge needs them, and goes back to
-    /// sleep with the next physics step. That follows from the velocities alone, and the warm start is put back: going
-    /// on from here equals going on from a restore.
+    /// Sleeping objects are woken, because MuJoCo leaves their contacts out and the judge needs them; they sleep again
+    /// after the next physics step. Which ones follows from the velocities alone, and the warm start is kept, so that
+    /// continuing from here equals continuing after a restore.
     fn forward(&mut self) {
         let warm_start = self.data.qacc_warmstart().to_vec();
         let model = self.data.model();
@@ -279,7 +281,7 @@ impl World {
         let resting = trees.filter(|(_, tree)| marks[**tree as usize] == READY_TO_SLEEP);
         let resting: Vec<usize> = resting.map(|(dof, _)| dof).collect();
         for &dof in &resting {
-            self.data.qvel_mut()[dof] = -0.0; // what MuJoCo wakes and nothing else
+            self.data.qvel_mut()[dof] = -0.0; // wakes them in MuJoCo and changes nothing else
         }
         self.data.forward();
         for &dof in &resting {
@@ -290,7 +292,7 @@ impl World {
         self.data.qacc_warmstart_mut().copy_from_slice(&warm_start);
     }
 
-    /// Brings poses and contacts up to date, and looks whether the physics is still sound.
+    /// Updates poses and contacts, and checks that the physics has not diverged.
     fn refresh(&mut self, steps: u32) -> Result<(), Fault> {
         self.forward();
         let warned = WARNINGS
