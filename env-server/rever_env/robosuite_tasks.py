@@ -13,6 +13,7 @@ from rever_env import opengl, tasks
 from rever_env.fault import InvalidReset, RendererUnavailable
 from rever_env.protocol import Dimension
 from rever_env.robosuite_motion import ARMS_TO_SCALE, is_moved_by_pose
+from rever_env.tasks import TaskId
 
 # What robosuite's documentation says each task is about.
 _INSTRUCTIONS = {
@@ -60,13 +61,15 @@ def offered(
     """Every named task with every named robot; InvalidReset for an unknown name.
 
     robots: ROBOT, or ROBOT+ROBOT for a task of two. A Bridge task has its own robot, horizon and
-    control rate, and may be named with a variant: see tasks.choose.
+    control rate, and may be named with a variant: see tasks.choose. "bridge" is every Bridge task
+    in every variant.
     """
     robosuite = load_robosuite()
     bridge = tasks.load()
-    known_bridge = {tasks.ALL, *(task.name for task in bridge.values())}
-    ours = [name for name in names if tasks.TaskId.parse(name).task in known_bridge]
-    own = {str(task.id): bridge_task(task) for task in tasks.choose(bridge, ours)}
+    known_bridge = {task.name for task in bridge.values()}
+    ours = [name for name in names if TaskId.parse(name).task in {tasks.BRIDGE, *known_bridge}]
+    chosen = tasks.choose(bridge, [tasks.ALL if name == tasks.BRIDGE else name for name in ours])
+    own = {str(task.id): bridge_task(task) for task in chosen}
     names = [name for name in names if name not in ours]
     for kind, given, known in (
         ("task", names, {*robosuite.ALL_ENVIRONMENTS, *bridge}),

@@ -30,7 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="Bridge tasks: TASK, TASK/VARIANT or TASK/all (default: every task and variant)",
     )
     kinds.add_argument(
-        "--robosuite", nargs="+", metavar="TASK", help="tasks of robosuite, and Bridge tasks in it"
+        "--robosuite",
+        nargs="+",
+        metavar="TASK",
+        help="tasks of robosuite, and Bridge tasks in it (named as in --tasks, or bridge: all)",
     )
     kinds.add_argument("--gymnasium", nargs="+", metavar="ID", help="environments of Gymnasium")
     group.add_argument(
@@ -165,7 +168,7 @@ def _check_used(arguments: argparse.Namespace) -> None:
     """An option that is accepted acts."""
     from rever_env import tasks
 
-    bridge = {tasks.ALL, *(task.name for task in tasks.load().values())}
+    bridge = {tasks.BRIDGE, *(task.name for task in tasks.load().values())}
     named = {tasks.TaskId.parse(name).task for name in arguments.robosuite or ()}
     has_own_robosuite = bool(named - bridge)
     is_gymnasium = bool(arguments.gymnasium)

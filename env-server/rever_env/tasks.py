@@ -19,6 +19,7 @@ Range = tuple[float, float]
 
 DEFAULT = "default"  # the variant of a task as its own table describes it
 ALL = "all"  # in place of a variant's or a task's name: every one of them
+BRIDGE = "bridge"  # the same, where other tasks can be named beside these
 _TABLE, _TEXT = "a table", "a text"
 
 
@@ -33,9 +34,9 @@ class TaskId(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "TaskId":
-        """TASK or TASK/VARIANT."""
-        task, slash, variant = text.partition("/")
-        return cls(task, variant if slash else DEFAULT)
+        """TASK or TASK/VARIANT; a task's own name may hold slashes, as in ALE/Pong-v5/default."""
+        task, slash, variant = text.rpartition("/")
+        return cls(task, variant) if slash else cls(text)
 
 
 class Pose(NamedTuple):

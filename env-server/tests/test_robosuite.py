@@ -2,6 +2,7 @@
 
 import gc
 from collections.abc import Iterator
+from dataclasses import replace
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -63,6 +64,27 @@ def test_save_and_restore_are_bit_exact(worlds: list[RobosuiteWorld]) -> None:
     assert same(world.restore(saved), saved_at)
     again = [world.step(MOVE).observation for _ in range(4)]
     assert all(same(*pair) for pair in zip(expected, again, strict=True))
+
+
+def test_the_bridge_tasks_are_offered_in_the_variants_that_are_named() -> None:
+    assert list(offered(["bridge"], [], 6, 20.0)) == list(tasks.load())
+    some = offered(["widowx_stack_cube", "widowx_carrot_on_plate/all"], [], 6, 20.0)
+    carrots = ["widowx_carrot_on_plate", "widowx_carrot_on_plate/size-0.5"]
+    assert list(some) == [*carrots, "widowx_stack_cube"]
+    assert {task.variant for task in some.values()} == {"default", "size-0.5"}
+    with pytest.raises(InvalidReset, match="task widowx_stack_cube/x: expected one of widowx_"):
+        offered(["widowx_stack_cube/x"], [], 6, 20.0)
+
+
+def test_a_change_of_the_robot_is_refused_in_robosuite() -> None:
+    from rever_env.robosuite_models import bridge_arena
+
+    task = tasks.load()["widowx_stack_cube"]
+    camera = tasks.MjcfChange("camera", "third_person", "focal", "0.5 0.5")
+    bridge_arena(replace(task, mjcf=(camera,)))
+    finger = tasks.MjcfChange("geom", "left_finger_pad", "friction", "2 0.01 0.0001")
+    with pytest.raises(InvalidReset, match="changes geom left_finger_pad"):
+        bridge_arena(replace(task, mjcf=(camera, finger)))
 
 
 def test_what_is_wrong_is_said(worlds: list[RobosuiteWorld]) -> None:

@@ -34,6 +34,7 @@ def test_the_text_of_an_id_can_be_read_again() -> None:
     for task in TASKS.values():
         assert TaskId.parse(str(task.id)) == task.id
     assert TaskId.parse("a/default") == TaskId("a") == TaskId.parse("a")
+    assert TaskId.parse("a/b/c") == TaskId("a/b", "c")
     assert (str(TaskId("a")), str(TaskId("a", "b"))) == ("a", "a/b")
 
 

@@ -232,7 +232,7 @@ impl From<[f64; 3]> for Pose {
 impl TaskId {
     /// TASK or TASK/VARIANT.
     pub fn parse(text: &str) -> TaskId {
-        let (task, variant) = text.split_once('/').unwrap_or((text, DEFAULT));
+        let (task, variant) = text.rsplit_once('/').unwrap_or((text, DEFAULT));
         TaskId { task: task.to_owned(), variant: variant.to_owned() }
     }
 }
