@@ -185,7 +185,6 @@ async fn a_reply_that_precedes_its_request_is_refused() {
     };
     let environment = Environment::open(&network, &server.id, open).await.expect("a session");
     let mut episode = environment.reset(reset).await.expect("an episode");
-    // The reply to the first step may come before or after the one that is ahead of its request.
     let fault = loop {
         match episode.step(&[0.0; 7]).await {
             Ok(transition) => assert!(!transition.terminated, "a forged reply was taken"),

@@ -214,12 +214,13 @@ def describes_nonsense() -> None:
 def answers_ahead() -> None:
     @wrap(Server, "_answer")
     def answer(original: Any, self: Any, lease: Any, request: Any) -> None:
-        original(self, lease, request)
-        last: Any = protocol.REPLY.decode(lease.session._last_reply)
-        if isinstance(last, protocol.Stepped):
-            transition = replace(last.transition, terminated=True)
-            ahead = replace(last, sequence=last.sequence + 1, transition=transition)
+        last = lease.session._last_reply
+        before: Any = protocol.REPLY.decode(last) if last else None
+        if isinstance(before, protocol.Stepped):
+            transition = replace(before.transition, terminated=True)
+            ahead = replace(before, sequence=before.sequence + 2, transition=transition)
             lease.outbox._publisher.put(protocol.REPLY.encode(ahead))
+        original(self, lease, request)
 
 
 class Unanswered(Exception):

@@ -72,17 +72,17 @@ impl Inbox {
     }
 
     /// A query on `describe` or `open`; given back where too many wait.
-    pub fn put_query(&self, work: Work) -> Result<(), Work> {
+    pub fn put_query(&self, work: Work) -> Option<Work> {
         let mut waiting = self.waiting();
         if waiting.queries.len() >= QUERIES_MAX {
-            return Err(work);
+            return Some(work);
         }
         waiting.queries.push_back(work);
         if waiting.queries.len() == 1 {
             waiting.turns.push_back(Source::Queries);
         }
         self.arrived.notify_one();
-        Ok(())
+        None
     }
 
     /// What is next, waited for until `deadline`.

@@ -129,7 +129,8 @@ impl<'a> Server<'a> {
         self.network
             .declare_queryable(key)
             .callback(move |query| {
-                if let Err(Work::Describe(query) | Work::Open(query)) = inbox.put_query(work(query))
+                if let Some(Work::Describe(query) | Work::Open(query)) =
+                    inbox.put_query(work(query))
                 {
                     answers.discard(query);
                 }

@@ -110,7 +110,8 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         counts(&excluded)
     );
     let set = TrainingSet::new(parser.hidden_size(), action_space.length(), episodes)?;
-    eprintln!("{} episodes, excluded: {}", set.episodes().len(), counts(&excluded));
+    let (count, repeats) = (set.episodes().len(), set.repeats());
+    eprintln!("{count} episodes, {repeats} repeats left out, excluded: {}", counts(&excluded));
     let options = options(&arguments)?;
     let verifier = train(&set, parser.digest(), &options, |epoch| report(epoch, &options))?;
     write(&arguments.out, verifier.bytes())?;
@@ -146,7 +147,7 @@ fn read(
     if arguments.runs.is_empty() {
         return records::from_labels(&arguments.labels, reader);
     }
-    Ok((records::from_runs(&arguments.runs, reader)?, Excluded::new()))
+    records::from_runs(&arguments.runs, reader)
 }
 
 /// Writes a whole file; a bare name has no folder to write the temporary file into.

@@ -163,11 +163,7 @@ impl Environment {
         while let Ok(payload) = self.replies.try_recv() {
             let reply: Reply = read(&payload)?;
             if reply.sequence() >= sequence {
-                return Err(EnvironmentFault::wire(format!(
-                    "expected request {sequence} to come before its reply, got {} for request {} first",
-                    reply.kind(),
-                    reply.sequence()
-                )));
+                return Err(early(&reply));
             }
         }
         Ok(())
@@ -211,6 +207,9 @@ impl Environment {
                 payload = self.replies.recv() => {
                     let payload = payload.ok_or_else(|| EnvironmentFault::wire("the network is closed"))?;
                     let reply = read(&payload)?;
+                    if reply.sequence() > self.sequence {
+                        return Err(early(&reply));
+                    }
                     // Number 0 is about the session itself, or about a request that could not be read.
                     if reply.sequence() == self.sequence || reply.sequence() == 0 {
                         self.reply_bytes = payload.len();
@@ -277,6 +276,15 @@ impl Environment {
 fn read(payload: &ZBytes) -> Result<Reply, EnvironmentFault> {
     protocol::codec::check_size::<Reply>(payload.len()).map_err(EnvironmentFault::wire)?;
     decode(&payload.to_bytes()).map_err(EnvironmentFault::wire)
+}
+
+/// For a reply to a request that was not sent yet.
+fn early(reply: &Reply) -> EnvironmentFault {
+    EnvironmentFault::wire(format!(
+        "expected request {} to come before its reply, got {} first",
+        reply.sequence(),
+        reply.kind()
+    ))
 }
 
 /// For a reply that does not belong to its request.

@@ -21,6 +21,8 @@ use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 
 /// A server that refused, most often because it is full, is asked again after this long.
 const REFUSED_PAUSE: Duration = Duration::from_secs(1);
+/// Where every server that offers the task is unfit for the run, another one is waited for no longer than this.
+const INCOMPATIBLE_WAIT: Duration = Duration::from_secs(2);
 /// The first time for which a server that did not answer is left out, doubled each time.
 const BACKOFF: Duration = Duration::from_secs(30);
 /// The longest such time.
@@ -241,7 +243,16 @@ impl ZenohPool {
         }
         let waits = *state.idle_since.get_or_insert_with(Instant::now);
         let had_any = !state.proven.is_empty() || !state.backoff.is_empty();
-        let patience = if had_any { self.options.wait } else { self.options.first_wait };
+        let all = fleet.servers.values();
+        let mut offering = all.filter(|server| offered(server, &request.task).is_some());
+        let is_hopeless = fleet.undescribed.is_empty()
+            && offering.all(|server| state.incompatible.contains_key(&server.server))
+            && !state.incompatible.is_empty();
+        let patience = match (is_hopeless, had_any) {
+            (true, _) => INCOMPATIBLE_WAIT,
+            (false, true) => self.options.wait,
+            (false, false) => self.options.first_wait,
+        };
         if waits.elapsed() >= patience {
             bail!(
                 "no session of {} could be opened within {} s: {}",
@@ -272,10 +283,15 @@ impl SessionPool for ZenohPool {
                 continue;
             }
             self.check_patience(request, &fleet)?;
-            tokio::select! {
-                () = freed => {}
-                changed = changes.changed() => if changed.is_err() { bail!("the network is closed") },
-                () = tokio::time::sleep(REFUSED_PAUSE) => {}
+            // Sooner or later even where nothing changes: backoffs and patience end by the clock.
+            let woken = async {
+                tokio::select! {
+                    () = freed => Ok(()),
+                    changed = changes.changed() => changed,
+                }
+            };
+            if let Ok(Err(_)) = tokio::time::timeout(REFUSED_PAUSE, woken).await {
+                bail!("the network is closed");
             }
         }
     }

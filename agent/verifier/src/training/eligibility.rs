@@ -103,7 +103,6 @@ pub fn exclude_label(outcome: &EpisodeOutcome, policy: &str) -> Option<Exclusion
 
 /// What excludes an episode, by its whole record.
 pub fn exclude_record(record: &EpisodeRecord, policy: &str) -> Option<ExclusionReason> {
-    let never_acted = || record.decisions().all(|decision| decision.chosen.is_none());
     exclude_label(&store::labels::outcome(record), policy)
-        .or_else(|| never_acted().then_some(ExclusionReason::NeverActed))
+        .or_else(|| (!record.has_outcome()).then_some(ExclusionReason::NeverActed))
 }

@@ -11,7 +11,7 @@ use store::record::{DecisionRecord, EpisodeRecord, hidden_from_bytes};
 use store::run::{record_path, recorded};
 
 use super::decision_sample::{self, DecisionSample};
-use super::eligibility::{exclude_label, exclude_record};
+use super::eligibility::{ExclusionReason, exclude_label, exclude_record};
 use super::set::{LayoutKey, TrainingEpisode};
 
 /// What the policy's own code says of recorded completions; records keep tokens.
@@ -24,29 +24,37 @@ pub struct CompletionReader<'a> {
     /// Reads a candidate's tokens.
     pub parse: &'a dyn Fn(&[u32]) -> Result<Parsed, Malformed>,
     /// How sure it was of a candidate's parts, from tokens and as many log-probabilities.
-    pub confidence: &'a dyn Fn(&[u32], &[f32]) -> Vec<f32>,
+    pub confidence: ReadConfidence<'a>,
 }
+
+/// From tokens and as many log-probabilities to one number for each part.
+pub type ReadConfidence<'a> = &'a dyn Fn(&[u32], &[f32]) -> Vec<f32>;
 
 /// Numbers of excluded episodes by reason.
 pub type Excluded = BTreeMap<&'static str, usize>;
 
-/// All episodes of the given runs; refuses, naming the record, when one of them is not eligible.
+/// The episodes of the given runs, and how many of them have no outcome; refuses, naming the record, when one is not
+/// eligible for another reason.
 ///
 /// A run was named by hand: leaving a part of it out in silence would hide a mistake.
 pub fn from_runs(
     folders: &[PathBuf],
     reader: CompletionReader<'_>,
-) -> anyhow::Result<Vec<TrainingEpisode>> {
-    let mut episodes = Vec::new();
+) -> anyhow::Result<(Vec<TrainingEpisode>, Excluded)> {
+    let (mut episodes, mut excluded) = (Vec::new(), Excluded::new());
     for folder in folders {
         for id in recorded(folder)? {
             let path = record_path(folder, &id);
             let record = EpisodeRecord::read(&path)?;
+            if !record.has_outcome() {
+                *excluded.entry(ExclusionReason::NeverActed.summary()).or_insert(0) += 1;
+                continue;
+            }
             let episode = eligible_episode(&record, reader);
             episodes.push(episode.with_context(|| format!("record {}", path.display()))?);
         }
     }
-    Ok(episodes)
+    Ok((episodes, excluded))
 }
 
 /// The eligible episodes of a label store, and how many were excluded for which reason.

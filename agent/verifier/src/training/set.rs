@@ -41,17 +41,26 @@ pub struct TrainingEpisode {
     pub decisions: Option<Vec<DecisionSample>>,
 }
 
+impl TrainingEpisode {
+    /// Whether the other one took the same course.
+    fn is_repeated_by(&self, other: &TrainingEpisode) -> bool {
+        (self.is_success, &self.steps, &self.hidden)
+            == (other.is_success, &other.steps, &other.hidden)
+    }
+}
+
 /// Episodes to train on, all of one policy.
 #[derive(Clone, Debug)]
 pub struct TrainingSet {
     input_size: usize,
     action_length: usize,
     episodes: Vec<TrainingEpisode>,
+    repeats: usize,
 }
 
 impl TrainingSet {
     /// Collects episodes of a policy with these sizes of hidden states and actions, in an order of their own, so that the
-    /// order of arrival makes no difference.
+    /// order of arrival makes no difference. An episode that was run twice, by the same seeds, counts once.
     pub fn new(
         input_size: usize,
         action_length: usize,
@@ -68,7 +77,16 @@ impl TrainingSet {
         if let Some(twins) = episodes.windows(2).find(|pair| pair[0].name == pair[1].name) {
             bail!("episode {}: expected once, got twice", twins[0].name);
         }
-        Ok(TrainingSet { input_size, action_length, episodes })
+        let all = episodes.len();
+        let mut different: Vec<TrainingEpisode> = Vec::with_capacity(all);
+        for episode in episodes {
+            let mut of_layout = different.iter().rev().take_while(|one| one.start == episode.start);
+            if !of_layout.any(|one| one.is_repeated_by(&episode)) {
+                different.push(episode);
+            }
+        }
+        let repeats = all - different.len();
+        Ok(TrainingSet { input_size, action_length, episodes: different, repeats })
     }
 
     /// Length of a hidden state.
@@ -84,6 +102,11 @@ impl TrainingSet {
     /// The episodes, sorted by their start and name.
     pub fn episodes(&self) -> &[TrainingEpisode] {
         &self.episodes
+    }
+
+    /// How many episodes were left out because another one is the same.
+    pub fn repeats(&self) -> usize {
+        self.repeats
     }
 
     /// Shares the episodes out; see [`split::split`].
@@ -162,6 +185,21 @@ pub(super) mod tests {
         let set = TrainingSet::new(2, 7, episodes).expect("a whole set");
         assert_eq!(set.labels(&[1, 0]), [false, false, false, true, true, true]);
         assert_eq!(set.hidden(&[1, 0]).count(), 6);
+    }
+
+    #[test]
+    fn an_episode_that_was_run_twice_counts_once() {
+        let mut other = episode("run-2/x", "a", 1, true);
+        other.hidden[0] = 0.25;
+        let all = [
+            episode("run-1/x", "a", 1, true),
+            other,
+            episode("run-3/x", "a", 1, true),
+            episode("run-1/y", "a", 2, true),
+        ];
+        let set = TrainingSet::new(2, 7, all).expect("a whole set");
+        let names: Vec<&str> = set.episodes().iter().map(|one| one.name.as_str()).collect();
+        assert_eq!((names, set.repeats()), (vec!["run-1/x", "run-2/x", "run-1/y"], 1));
     }
 
     #[test]

@@ -97,6 +97,17 @@ fn decision(record: &mut EpisodeRecord, index: usize) -> &mut DecisionRecord {
     record.steps[index].decision.as_mut().expect("a decision")
 }
 
+/// As if no candidate was ever well formed.
+fn never_act(record: &mut EpisodeRecord) {
+    for decision in record.steps.iter_mut().filter_map(|step| step.decision.as_mut()) {
+        decision.chosen = None;
+        for candidate in &mut decision.candidates {
+            candidate.actions = None;
+            candidate.malformed = Some("expected an action, got none".to_owned());
+        }
+    }
+}
+
 fn write(folder: &Path, records: &[EpisodeRecord]) {
     std::fs::create_dir_all(folder.join("episodes")).expect("a folder");
     for record in records {
@@ -202,9 +213,7 @@ fn hidden_states_of_selected_candidates_are_not_used() {
 #[test]
 fn an_episode_in_which_the_policy_never_acted_is_no_outcome() {
     let mut record = record(0);
-    for step in &mut record.steps {
-        step.decision.iter_mut().for_each(|decision| decision.chosen = None);
-    }
+    never_act(&mut record);
     assert_eq!(
         read(&record).expect_err("no action").to_string(),
         "expected at least one executed candidate, got an episode in which the robot held still"
@@ -216,7 +225,11 @@ fn a_run_with_one_ineligible_record_is_refused_by_its_name() {
     let folder = tempfile::tempdir().expect("a folder");
     let runs = [folder.path().to_path_buf()];
     write(folder.path(), &[record(0), record(1)]);
-    assert_eq!(with_reader(|reader| from_runs(&runs, reader)).expect("two episodes").len(), 2);
+    let mut idle = record(3);
+    never_act(&mut idle);
+    write(folder.path(), &[idle]);
+    let (episodes, excluded) = with_reader(|reader| from_runs(&runs, reader)).expect("eligible");
+    assert_eq!((episodes.len(), excluded), (2, Excluded::from([("the policy never acted", 1)])));
     let mut bad = record(2);
     bad.identity.layout = Some(7);
     write(folder.path(), &[bad]);
@@ -234,9 +247,7 @@ fn a_label_store_counts_what_is_excluded_by_its_reason() {
     let mut records: Vec<EpisodeRecord> = (0..7).map(record).collect();
     records[1].identity.seed = SeedRange::Evaluation.first();
     records[2].versions.policy = "beef".to_owned();
-    for step in &mut records[4].steps {
-        step.decision.iter_mut().for_each(|decision| decision.chosen = None);
-    }
+    never_act(&mut records[4]);
     write(folder.path(), &records);
     let file = |record: &EpisodeRecord| record_path(folder.path(), &record.identity.id());
     let path = folder.path().join("labels.sqlite");
