@@ -4,6 +4,7 @@ zenoh makes a sender wait for a peer that stops reading, up to a minute, and nob
 with it.
 """
 
+import contextlib
 import logging
 import queue
 import threading
@@ -42,12 +43,13 @@ class Outbox:
             self._changed.notify()
 
     def _send_all(self) -> None:
-        try:
-            while (reply := self._next()) is not None:
+        while (reply := self._next()) is not None:
+            try:
                 self._publisher.put(reply)
+            except zenoh.ZError as error:
+                _log.warning("a reply was not sent: %s", error)
+        with contextlib.suppress(zenoh.ZError):  # the network may be closed already
             self._publisher.undeclare()
-        except zenoh.ZError as error:
-            _log.warning("a reply was not sent: %s", error)
 
     def _next(self) -> bytes | None:
         with self._changed:
