@@ -5,16 +5,39 @@ import sys
 import time
 from pathlib import Path
 
+from rever_env.argument_types import endpoint, fleet
+
 _ASK_SECS = 2.0  # one query; a link that has just been opened may not lead anywhere yet
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments of health."""
-    parser.add_argument("--connect", required=True, metavar="ENDPOINT", help="tcp/127.0.0.1:7448")
-    parser.add_argument("--fleet", default="local", help="who meets whom (default: local)")
-    parser.add_argument("--timeout-secs", type=float, default=5.0, help="(default: 5)")
     parser.add_argument(
-        "--id-file", type=Path, help="ask only the server that was started with this --id-file"
+        "--connect",
+        required=True,
+        type=endpoint,
+        metavar="ENDPOINT",
+        help="a server or a router, such as tcp/127.0.0.1:7448",
+    )
+    parser.add_argument(
+        "--fleet",
+        type=fleet,
+        default="local",
+        metavar="NAME",
+        help="namespace: only servers of this fleet are asked (default: local)",
+    )
+    parser.add_argument(
+        "--timeout-secs",
+        type=float,
+        default=5.0,
+        metavar="SECONDS",
+        help="how long to wait for an answer (default: 5)",
+    )
+    parser.add_argument(
+        "--id-file",
+        type=Path,
+        metavar="FILE",
+        help="ask only the server that was started with this --id-file",
     )
     parser.set_defaults(run=health)
 
@@ -24,33 +47,37 @@ def health(arguments: argparse.Namespace) -> int:
     import zenoh
 
     from rever_env import protocol
-    from rever_env.serving import Endpoints
+    from rever_env.serving import Endpoints, cause
 
     seconds = arguments.timeout_secs
     endpoints = Endpoints((arguments.connect,), (), multicast=False, wait_secs=seconds)
     keys = protocol.Keys(arguments.fleet)
     deadline = time.monotonic() + seconds
-    found = 0
+    found, misread = 0, ""
     try:
         one = arguments.id_file and arguments.id_file.read_text(encoding="utf-8")
         network = zenoh.open(zenoh.Config.from_json5(endpoints.configuration()))
     except (OSError, zenoh.ZError) as error:
-        return _nobody(arguments, f": {error}")
+        return _unanswered(arguments, f": {cause(error)}")
     key = keys.describe(one) if one else keys.describe_all()
     with network:
         while not found and time.monotonic() < deadline:
             for reply in network.get(key, timeout=_ASK_SECS):
                 if reply.ok is None:
                     continue
-                server = protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes())
+                try:
+                    server = protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes())
+                except protocol.CodecError as error:
+                    misread = f"; the description of one cannot be read: {error}"
+                    continue
                 print(
                     f"{server.server}: {server.sessions} of {server.sessions_max} sessions in use"
                 )
                 found += 1
-    return 0 if found else _nobody(arguments, "")
+    return 0 if found else _unanswered(arguments, misread)
 
 
-def _nobody(arguments: argparse.Namespace, why: str) -> int:
+def _unanswered(arguments: argparse.Namespace, why: str) -> int:
     print(
         f"error: no server of fleet {arguments.fleet} answered at {arguments.connect} "
         f"within {arguments.timeout_secs:g} s{why}",

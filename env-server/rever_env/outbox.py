@@ -15,9 +15,10 @@ import zenoh
 _log = logging.getLogger(__name__)
 
 _ANSWERING_MAX = 64  # threads that answer queries at one time; almost always there is none
-# Queries that wait for their end unanswered: more than come before zenoh closes the link of a peer
-# that stopped reading.
+# Queries that wait for their end unanswered, and what they hold: more than ordinary use brings in
+# the minute until zenoh closes the link of a peer that stopped reading.
 _DISCARDED_MAX = 16_384
+_DISCARDED_BYTES_MAX = 32 << 20
 
 
 class Outbox:
@@ -65,6 +66,8 @@ class Answers:
     def __init__(self) -> None:
         self._answering = threading.Semaphore(_ANSWERING_MAX)
         self._discarded: queue.Queue[Any] = queue.Queue(_DISCARDED_MAX)
+        self._discarded_bytes = 0
+        self._counting = threading.Lock()
         threading.Thread(target=self._discard_all, name="discarded", daemon=True).start()
 
     def send(self, query: Any, key: str, answer: bytes) -> None:
@@ -86,6 +89,10 @@ class Answers:
 
     def discard(self, query: Any) -> None:
         """Ends a query unanswered without waiting, but for a peer that reads none of many ends."""
+        if self._discarded_bytes > _DISCARDED_BYTES_MAX:
+            query.drop()
+            return
+        self._count(size(query))
         self._discarded.put(query)
 
     def close(self) -> None:
@@ -94,4 +101,15 @@ class Answers:
 
     def _discard_all(self) -> None:
         while (query := self._discarded.get()) is not None:
+            held = size(query)
             query.drop()
+            self._count(-held)
+
+    def _count(self, change: int) -> None:
+        with self._counting:
+            self._discarded_bytes += change
+
+
+def size(query: Any) -> int:
+    """Bytes of a query's payload."""
+    return 0 if query.payload is None else len(query.payload)

@@ -21,7 +21,7 @@ import zenoh
 from rever_env import protocol
 from rever_env.fault import Fault
 from rever_env.inbox import Inbox
-from rever_env.outbox import Answers, Outbox
+from rever_env.outbox import Answers, Outbox, size
 from rever_env.protocol import limits
 from rever_env.session import Session, refused
 from rever_env.worlds import UnknownTask, Worlds
@@ -127,9 +127,18 @@ class Server:
                 work()
 
     def _queryable(self, key: str, answer: Callable[[Any], bytes]) -> Any:
-        """Leaves the queries on key to the simulation thread and drops what is too much."""
+        """Leaves the queries on key to the simulation thread.
+
+        It refuses what is too large and drops what is too much.
+        """
 
         def on_query(query: Any) -> None:
+            try:
+                protocol.OPEN.check_size(size(query))
+            except protocol.TooLarge as error:
+                refusal = protocol.OPENING.encode(protocol.OpenRefused(str(error)))
+                self._answers.send(query, key, refusal)
+                return
             if not self._inbox.put_query(lambda: self._answers.send(query, key, answer(query))):
                 self._answers.discard(query)
 
@@ -168,9 +177,7 @@ class Server:
     def _open(self, query: Any) -> bytes:
         answer: protocol.Opened | protocol.OpenRefused
         try:
-            size = 0 if query.payload is None else len(query.payload)
-            protocol.OPEN.check_size(size)
-            opened = protocol.OPEN.decode(query.payload.to_bytes() if size else b"")
+            opened = protocol.OPEN.decode(query.payload.to_bytes() if size(query) else b"")
             if self._sessions() >= self._options.sessions_max:
                 raise ValueError(f"all {self._options.sessions_max} sessions are in use")
             answer = protocol.Opened(self._lease(opened))

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rever_env import endpoint, simulators
-from rever_env.protocol import Keys, limits
+from rever_env import simulators
+from rever_env.argument_types import endpoint, fleet, session_count
+from rever_env.protocol import limits
 
 if TYPE_CHECKING:
     from rever_env.worlds import Worlds
@@ -32,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--connect",
         action="append",
         default=[],
-        type=_endpoint,
+        type=endpoint,
         metavar="ENDPOINT",
         help="a router or an agent to connect to, such as tcp/127.0.0.1:7447; repeatable",
     )
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--listen",
         action="append",
         default=[],
-        type=_endpoint,
+        type=endpoint,
         metavar="ENDPOINT",
         help="where to listen, such as tcp/127.0.0.1:7448; every peer that reaches it is trusted; "
         "repeatable",
@@ -52,14 +53,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--fleet",
-        type=_fleet,
+        type=fleet,
         default="local",
         metavar="NAME",
         help="namespace: peers see each other only within the same fleet (default: local)",
     )
     parser.add_argument(
         "--sessions",
-        type=_sessions,
+        type=session_count,
         default=16,
         metavar="COUNT",
         help="largest number of sessions open at the same time (default: 16)",
@@ -81,27 +82,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     simulators.add_arguments(parser)
     parser.set_defaults(run=serve)
-
-
-def _endpoint(text: str) -> str:
-    try:
-        return endpoint.checked(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _fleet(text: str) -> str:
-    try:
-        Keys(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return text
-
-
-def _sessions(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= limits.SESSIONS_MAX:
-        raise argparse.ArgumentTypeError(f"expected 1 to {limits.SESSIONS_MAX}, got {text}")
-    return int(text)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What became of one episode, for whoever collects labels or watches."""
+"""What became of one episode, for observers."""
 
 from dataclasses import dataclass
 

@@ -2,7 +2,7 @@
 //! reading, up to a minute, and nobody else may wait with it.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 
@@ -14,8 +14,10 @@ use zenoh::query::Query;
 
 /// Threads that answer queries at one time; almost always there is none.
 const ANSWERING_MAX: usize = 64;
-/// Queries that wait for their end unanswered: more than come before zenoh closes the link of a peer that stopped reading.
+/// Queries that wait for their end unanswered, and what they hold: more than ordinary use brings in the minute until zenoh
+/// closes the link of a peer that stopped reading.
 const DISCARDED_MAX: usize = 16_384;
+const DISCARDED_BYTES_MAX: usize = 32 << 20;
 
 /// A session's replies. Dropping it ends its thread after the last one.
 pub struct Outbox(Arc<Slot>);
@@ -90,17 +92,27 @@ impl Slot {
 pub struct Answers {
     answering: Arc<AtomicUsize>,
     discarded: SyncSender<Query>,
+    discarded_bytes: Arc<AtomicUsize>,
 }
 
 impl Answers {
     /// Starts the thread that ends queries unanswered.
     pub fn new() -> Result<Answers> {
-        let (discarded, queries) = sync_channel(DISCARDED_MAX);
+        let (discarded, queries) = sync_channel::<Query>(DISCARDED_MAX);
+        let discarded_bytes = Arc::new(AtomicUsize::new(0));
+        let held = Arc::clone(&discarded_bytes);
+        let end_all = move || {
+            for query in queries {
+                let size = size(&query);
+                drop(query);
+                held.fetch_sub(size, Ordering::Relaxed);
+            }
+        };
         thread::Builder::new()
             .name("discarded".to_owned())
-            .spawn(move || queries.iter().for_each(drop))
+            .spawn(end_all)
             .context("cannot start a thread")?;
-        Ok(Answers { answering: Arc::default(), discarded })
+        Ok(Answers { answering: Arc::default(), discarded, discarded_bytes })
     }
 
     /// Answers on a thread of its own; drops the query where too many answers wait for their readers.
@@ -125,10 +137,16 @@ impl Answers {
 
     /// Ends a query unanswered without waiting.
     pub fn discard(&self, query: Query) {
-        match self.discarded.try_send(query) {
-            Ok(()) => {}
-            // Nothing is left but to wait for the peer that reads none of so many ends.
-            Err(TrySendError::Full(query) | TrySendError::Disconnected(query)) => drop(query),
+        let size = size(&query);
+        let held = self.discarded_bytes.fetch_add(size, Ordering::Relaxed);
+        // Beyond the limits nothing is left but to wait for the peer that reads none of so many ends.
+        if held > DISCARDED_BYTES_MAX || self.discarded.try_send(query).is_err() {
+            self.discarded_bytes.fetch_sub(size, Ordering::Relaxed);
         }
     }
+}
+
+/// Bytes of a query's payload.
+pub fn size(query: &Query) -> usize {
+    query.payload().map_or(0, |payload| payload.len())
 }

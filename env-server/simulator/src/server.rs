@@ -21,7 +21,7 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session as Network, Wait};
 
 use crate::inbox::{Inbox, Work};
-use crate::outbox::{Answers, Outbox};
+use crate::outbox::{Answers, Outbox, size};
 use crate::session::{Session, refused};
 use crate::worlds::Worlds;
 
@@ -123,13 +123,18 @@ impl<'a> Server<'a> {
         Ok(())
     }
 
-    /// Leaves the queries on `key` to the simulation thread and drops what is too much.
+    /// Leaves the queries on `key` to the simulation thread, refuses what is too large and drops what is too much.
     fn queryable(&self, key: String, work: fn(Query) -> Work) -> Result<Queryable<()>> {
         let (inbox, answers) = (Arc::clone(&self.inbox), self.answers.clone());
+        let of = key.clone();
         self.network
             .declare_queryable(key)
             .callback(move |query| {
-                if let Some(Work::Describe(query) | Work::Open(query)) =
+                if let Err(error) = codec::check_size::<Open>(size(&query)) {
+                    let refused = Opening::Refused { reason: error.to_string() };
+                    let bytes = encode(&refused).expect("a reason within its limit can be written");
+                    answers.send(query, of.clone(), bytes);
+                } else if let Some(Work::Describe(query) | Work::Open(query)) =
                     inbox.put_query(work(query))
                 {
                     answers.discard(query);
@@ -196,10 +201,7 @@ impl<'a> Server<'a> {
 
     /// A new session; everything that hears its requests stands when this returns.
     fn lease(&mut self, query: &Query) -> Result<String> {
-        let payload = query.payload();
-        let size = payload.map_or(0, |payload| payload.len());
-        codec::check_size::<Open>(size)?;
-        let bytes = payload.map(|payload| payload.to_bytes()).unwrap_or_default();
+        let bytes = query.payload().map(|payload| payload.to_bytes()).unwrap_or_default();
         let opened: Open = decode(&bytes)?;
         let sessions_max = self.options.sessions_max;
         ensure!(self.sessions() < sessions_max, "all {sessions_max} sessions are in use");
