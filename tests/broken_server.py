@@ -108,7 +108,6 @@ def never_ends() -> None:
 
 def keeps_leases() -> None:
     Server._end_abandoned = lambda self, as_of: None
-    Server._end_gone = lambda self: None
 
 
 def mute() -> None:

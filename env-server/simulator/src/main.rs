@@ -33,6 +33,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use assets::Assets;
 use clap::{Parser, Subcommand};
+use tracing_subscriber::EnvFilter;
 
 /// The Bridge tasks in MuJoCo: environment server and traces
 #[derive(Parser)]
@@ -51,6 +52,9 @@ enum Command {
     Trace(trace::Arguments),
 }
 
+/// What zenoh logs below an error names the places in its sources, which are paths of the machine that built it.
+const LOG_FILTER: &str = "info,zenoh=error,zenoh_transport=off,zenoh_link=off,zenoh_link_tcp=off";
+
 fn main() -> ExitCode {
     let (name, value) = camera::DRAWING_THREADS;
     if std::env::var_os(name).is_none() {
@@ -58,7 +62,11 @@ fn main() -> ExitCode {
         unsafe { std::env::set_var(name, value) };
     }
     let program = Program::parse();
-    tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).init();
+    tracing_subscriber::fmt()
+        .with_env_filter(EnvFilter::new(LOG_FILTER))
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .init();
     match run(program) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
