@@ -21,6 +21,7 @@ _NOBODY_SECS = 5.0  # how long no server may be found over a connection
 _WAIT_SECS = 30.0  # for a server that is there to be free, or to answer
 _REACH_SECS = 5.0  # for one connection
 _RETURN_SECS = 2.0  # from a new connection to the server's token
+_OUTAGE_SECS = 10.0  # a session outlives its holder's absence that long
 
 
 class RemoteFault(RuntimeError):
@@ -115,6 +116,7 @@ class Network:
         self._is_closed = False
         self.is_absent = True  # no token of the server is seen (yet, or any more)
         self._was_seen = False
+        self._absent_since = time.monotonic()
         self._connected_since: float | None = None  # while it is absent
         self.restored_at = 0.0  # when the server's token came back, if it ever did
         _open_networks.add(self)
@@ -187,7 +189,7 @@ class Network:
                     self.restored_at = time.monotonic()
                 self.is_absent, self._was_seen = False, True
             else:
-                self._connected_since = None
+                self._absent_since, self._connected_since = time.monotonic(), None
                 self.is_absent = True
                 wake()
 
@@ -203,20 +205,24 @@ class Network:
         """What has become of the watched server, for messages; nothing while it may still answer.
 
         One that is only paused may: for a while its connection stands, and then its endpoint still
-        accepts new ones.
+        accepts new ones. So may one behind a router, whose connection or whose router may come back
+        in time; a session outlives that as long.
         """
         if not self.is_absent:
             return ""
-        info = self.zenoh.info
-        if not [*info.routers_zid(), *info.peers_zid()]:
+        now, info = time.monotonic(), self.zenoh.info
+        is_connected = bool([*info.routers_zid(), *info.peers_zid()])
+        if not is_connected:
             self._connected_since = None
-            if self._accepts():
-                return ""
-            return "cannot be reached: the router is gone" if self._is_routed else "is gone"
-        now = time.monotonic()
-        if self._connected_since is None:
+        elif self._connected_since is None:
             self._connected_since = now
-        return "is gone" if now > self._connected_since + _RETURN_SECS else ""
+        if self._is_routed and now < self._absent_since + _OUTAGE_SECS:
+            return ""
+        if self._connected_since is not None:
+            return "is gone" if now > self._connected_since + _RETURN_SECS else ""
+        if self._accepts():
+            return ""
+        return "cannot be reached: the router is gone" if self._is_routed else "is gone"
 
     def _accepts(self) -> bool:
         for one in self._fleet.connect:

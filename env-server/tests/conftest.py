@@ -64,8 +64,9 @@ def end(process: "subprocess.Popen[str]") -> None:
     """Kills a server, stopped or not."""
     process.kill()
     process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
+    for stream in (process.stdin, process.stdout):
+        if stream is not None:
+            stream.close()
 
 
 def pause(process: "subprocess.Popen[str]") -> None:

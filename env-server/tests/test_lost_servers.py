@@ -116,6 +116,61 @@ def test_a_stopped_server_does_not_hold_up_close() -> None:
         assert time.monotonic() - begun < 10.0
 
 
+ROUTER = """
+import json, sys, time, zenoh
+scouting = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+configuration = {"mode": "router", "listen": {"endpoints": [sys.argv[1]]}, "scouting": scouting}
+network = zenoh.open(zenoh.Config.from_json5(json.dumps(configuration)))
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def route(endpoint: str) -> "subprocess.Popen[str]":
+    """A router that is ready."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", ROUTER, endpoint],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_a_router_that_comes_back_costs_no_episode_and_one_that_does_not_is_named() -> None:
+    endpoint = free_endpoint()
+    routers = [route(endpoint)]
+    server = subprocess.Popen(
+        [sys.executable, "-m", "rever_env", "serve", "--connect", endpoint],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        assert server.stdout is not None and server.stdout.readline().startswith("ready")
+        remote = rever_env.RemoteEnv(endpoint, **SMALL, wait_secs=30.0)
+        local = rever_env.BridgeEnv(remote.session.task.task, **SMALL)
+        for environment in (remote, local):
+            environment.reset(seed=0)
+        move = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
+        end(routers[0])
+        timer = threading.Timer(1.0, lambda: routers.append(route(endpoint)))
+        timer.start()
+        for _ in range(2):  # once each, however often it was sent
+            assert np.array_equal(remote.step(move)[0]["state"], local.step(move)[0]["state"])
+        timer.join()
+        end(routers[1])
+        with pytest.raises(RemoteFault, match="cannot be reached: the router is gone"):
+            remote.step(move)
+        remote.close()
+        local.close()
+    finally:
+        end(server)
+        for process in routers:
+            end(process)
+
+
 FORKING = """
 import gymnasium, os, sys, rever_env
 environment = rever_env.RemoteEnv(sys.argv[1], image_height=8, image_width=8)
@@ -148,7 +203,7 @@ def test_forked_environments_say_so_instead_of_hanging(endpoint: str) -> None:
         [sys.executable, "-u", "-c", FORKING, endpoint, "widowx_stack_cube"],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=120,
         check=False,
     )
     words = "do not work in a forked process"
