@@ -66,10 +66,8 @@ impl Table<'_> {
         test: impl Future<Output = Result<Tested>>,
     ) {
         let result = test.await;
-        if result.is_err() {
-            // What the test left open must not fail the next one.
-            self.subject.settle().await;
-        }
+        // What the test left open must not fail the next one.
+        self.subject.settle().await;
         let (verdict, reason) = match result {
             Ok(Tested::Kept) => (Verdict::Pass, None),
             Ok(Tested::NotTested(reason)) => (Verdict::Skip, Some(reason)),
