@@ -1,7 +1,7 @@
 //! Decisions in batches: whatever episodes are ready share one pass of the policy.
 //!
 //! No episode waits for a server of another one. While a batch is decided, the episodes of the one before it are stepped
-//! and come back; a batch that would be small waits for them, but never for long.
+//! and come back; a batch waits for them, but never for long.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -12,8 +12,9 @@ use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
 
-/// How long a batch that holds fewer than half of the running episodes waits for more of them.
-const BATCH_WAIT: Duration = Duration::from_millis(4);
+/// How long a batch waits for the running episodes that it lacks: a pass over many costs little more than one over few, so
+/// that waiting for a step is worth it, and waiting for a slow server is not.
+const BATCH_WAIT: Duration = Duration::from_millis(15);
 /// Episodes that may wait to be read; every one of them is held by a worker of its own.
 const WAITING_MAX: usize = 4096;
 
@@ -79,7 +80,7 @@ async fn decide_batches(
     }
 }
 
-/// All episodes that are ready; where these are few, those as well that become ready soon.
+/// All episodes that are ready, and those that become ready soon.
 async fn gather(
     first: Waiting,
     received: &mut mpsc::Receiver<Waiting>,
@@ -91,7 +92,7 @@ async fn gather(
         while let Ok(next) = received.try_recv() {
             batch.push(next);
         }
-        if 2 * batch.len() >= active.load(Ordering::Acquire) {
+        if batch.len() >= active.load(Ordering::Acquire) {
             return batch;
         }
         match timeout_at(deadline, received.recv()).await {
