@@ -25,7 +25,7 @@ from rever_env.serving import Endpoints
 
 KEYS = protocol.Keys("local")
 WAIT_SECS = 60.0
-PAUSE_SECS_MAX = 12.0  # for others: a minute is what zenoh waits for a peer that stops reading
+PAUSE_SECS_MAX = 6.0  # for others: zenoh waits a minute for a peer that stops reading
 GROWTH_BYTES_MAX = 300 << 20
 MOTION = np.array([0.01, 0.0, -0.01, 0.0, 0.0, 0.0, -1.0], np.float32)
 SERVERS = {"python": [sys.executable, "-m", "rever_env"]}
