@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rever_env import tasks
 from rever_env.fault import InvalidAction, InvalidReset, PhysicsDiverged
@@ -193,14 +194,30 @@ def test_bridge_tasks_are_reproducible_and_saved_exactly(bridge: RobosuiteWorld)
     run(bridge, 8)
     again = run(bridge, 7)
     assert all(same(*pair) for pair in zip(expected, again, strict=True))
-    saved = bridge.save()
+    saved, goal = bridge.save(), commanded(bridge)
     after = [bridge.step(MOVE) for _ in range(3)]
     bridge.reset(layout=0, seed=0)
+    assert not np.array_equal(commanded(bridge), goal)
     bridge.restore(saved)
+    np.testing.assert_array_equal(commanded(bridge), goal)
     for transition in after:
         repeated = bridge.step(MOVE)
         assert same(repeated.observation, transition.observation)
         assert repeated.statistics == transition.statistics
+
+
+def commanded(world: RobosuiteWorld) -> NDArray[np.float64]:
+    """The commanded position in the base's frame, (3,)."""
+    controller = world._environment.robots[0].part_controllers["right"]
+    position: NDArray[np.float64] = np.array(controller.goal_pos)
+    return position
+
+
+def test_a_task_has_another_version_where_its_episodes_differ() -> None:
+    ours = tasks.load()["widowx_stack_cube"]
+    offers = offered([ours.name, "Lift"], ["Panda"], 6, 20.0)
+    assert offers[ours.name].version > ours.version
+    assert offers["Lift/Panda"].version > 1
 
 
 @pytest.mark.parametrize("task", list(tasks.load()))
