@@ -36,7 +36,7 @@ pub struct Arguments {
     #[arg(long, value_name = "FOLDER")]
     policy: Option<PathBuf>,
     /// The verifier's file.
-    #[arg(long, default_value = "verifier.safetensors")]
+    #[arg(long, default_value = "verifier.safetensors", value_parser = super::output_file)]
     out: PathBuf,
     /// Seed of the split, the first weights and the order of samples.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
@@ -66,7 +66,7 @@ pub struct Arguments {
     #[arg(long)]
     plain: bool,
     /// Also write the figures to this file.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
     /// Publish the verifier under this name to agents that follow it.
     #[arg(long, requires = "connect")]

@@ -111,6 +111,21 @@ fn a_label_is_there_with_its_record_and_neither_without_the_other() {
 }
 
 #[test]
+fn an_episode_in_which_the_policy_never_acted_is_recorded_without_a_label() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let mut record = episode(&run, 0);
+    for decision in record.steps.iter_mut().filter_map(|step| step.decision.as_mut()) {
+        decision.chosen = None;
+    }
+    run.record(&record).expect("recorded");
+    assert_eq!(episodes(&run.summaries().expect("summaries")), [0]);
+    drop(run);
+    drop(open(folder.path()));
+    assert_eq!(stored(folder.path()), []);
+}
+
+#[test]
 fn labels_that_could_not_be_written_are_said_at_the_end_and_completed_at_the_next_start() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
