@@ -10,7 +10,7 @@ use evaluation::table::aligned;
 use runtime::servers::Host;
 use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
 use serde::Serialize;
-use store::record::write_whole;
+use store::write_whole;
 use verifier::training::records::{self, CompletionReader, Excluded};
 use verifier::training::{Epoch, TrainingEpisode, TrainingSet, train};
 use verifier::{
@@ -152,7 +152,7 @@ fn read(
 
 /// Writes a whole file; a bare name has no folder to write the temporary file into.
 fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    write_whole(&Path::new(".").join(path), bytes)
+    write_whole(path, bytes)
 }
 
 fn options(arguments: &Arguments) -> Result<TrainingOptions> {
