@@ -9,12 +9,7 @@ use sha2::{Digest, Sha256};
 
 use crate::record::{EpisodeIdentity, EpisodeRecord};
 
-/// The digest of a set of episodes, hexadecimal.
-pub fn digest<'a>(records: impl IntoIterator<Item = &'a EpisodeRecord>) -> String {
-    combined_digest(records.into_iter().map(episode_digest).collect())
-}
-
-/// The digest of episodes from their own digests, so that no more than one record need be in memory at once.
+/// The digest of a set of episodes from their own digests, hexadecimal, so that no more than one record need be in memory at once.
 pub fn combined_digest(mut episodes: Vec<[u8; 32]>) -> String {
     episodes.sort_unstable();
     hex(&Sha256::digest(episodes.concat()))
@@ -106,6 +101,10 @@ fn add_option(hash: &mut Sha256, value: Option<u32>) {
 mod tests {
     use super::*;
     use crate::record::tests::made_up;
+
+    fn digest<'a>(records: impl IntoIterator<Item = &'a EpisodeRecord>) -> String {
+        combined_digest(records.into_iter().map(episode_digest).collect())
+    }
 
     #[test]
     fn the_digest_never_changes_between_versions() {

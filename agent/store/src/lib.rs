@@ -23,5 +23,5 @@ pub mod video;
 mod digest;
 mod durable;
 
-pub use digest::{combined_digest, digest, episode_digest, hex};
+pub use digest::{combined_digest, episode_digest, hex};
 pub use durable::{check_writable, write_whole};

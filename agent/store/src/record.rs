@@ -11,7 +11,6 @@ use half::f16;
 use protocol::Statistics;
 use serde::{Deserialize, Serialize};
 
-pub use crate::durable::write_whole;
 pub use crate::identity::EpisodeIdentity;
 pub use file::{ReadError, RecordFile};
 

@@ -57,7 +57,7 @@ struct DecisionArguments {
     #[arg(long, value_name = "FILE", default_value = "python3")]
     python: PathBuf,
     /// Write the figures into this file, too
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 
@@ -90,7 +90,7 @@ struct ThroughputArguments {
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
     /// Write the figures into this file, too
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 
@@ -132,7 +132,7 @@ struct StepsArguments {
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
     /// Write the figures into this file, too
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 

@@ -30,7 +30,7 @@ pub struct Arguments {
     #[arg(long, default_value_t = 1.0, value_parser = temperature)]
     temperature: f32,
     /// Write the results to this file, too.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 

@@ -35,7 +35,7 @@ pub struct Arguments {
     #[arg(long)]
     out: Option<PathBuf>,
     /// Also write the figures to this file, in the form of `rever evaluate`
-    #[arg(long)]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
     /// A Python that has the packages already, instead of the one that is set up
     #[arg(long)]

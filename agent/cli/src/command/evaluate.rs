@@ -34,7 +34,7 @@ pub struct Arguments {
     #[arg(long, value_delimiter = ',', default_value = "1", value_parser = temperature)]
     temperature: Vec<f32>,
     /// Write the results to this file, too.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 

@@ -12,6 +12,7 @@ mod report;
 mod train;
 
 use std::fmt;
+use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -76,3 +77,37 @@ impl fmt::Display for WrongUsage {
 }
 
 impl std::error::Error for WrongUsage {}
+
+/// A file that is written at the end of the command, tried before anything is done for it.
+pub fn output_file(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    store::check_writable(&path).map_err(|error| format!("{error:#}"))?;
+    Ok(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_cannot_be_written_is_wrong_usage_of_every_command_that_writes_one() {
+        let commands: [&[&str]; 9] = [
+            &["demo"],
+            &["evaluate"],
+            &["collect"],
+            &["train"],
+            &["report", "run"],
+            &["doctor"],
+            &["conformance"],
+            &["bench", "decision"],
+            &["bench", "simulators"],
+        ];
+        for command in commands {
+            let words = ["rever"].iter().chain(command).chain(&["--json", "/proc/none/x.json"]);
+            let error = Program::try_parse_from(words).expect_err("it cannot be written");
+            assert_eq!(error.exit_code(), 2, "{command:?}: {error}");
+            let text = error.to_string();
+            assert!(text.contains("cannot write /proc/none/x.json"), "{command:?}: {text}");
+        }
+    }
+}

@@ -31,7 +31,7 @@ pub struct Arguments {
     #[arg(long, default_value_t = EPISODES_MAX)]
     episodes_max: usize,
     /// Also write what was made to this file
-    #[arg(long)]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 

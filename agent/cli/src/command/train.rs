@@ -10,7 +10,7 @@ use evaluation::table::aligned;
 use runtime::servers::Host;
 use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
 use serde::Serialize;
-use store::record::write_whole;
+use store::write_whole;
 use verifier::training::records::{self, CompletionReader, Excluded};
 use verifier::training::{Epoch, TrainingEpisode, TrainingSet, train};
 use verifier::{
@@ -36,7 +36,7 @@ pub struct Arguments {
     #[arg(long, value_name = "FOLDER")]
     policy: Option<PathBuf>,
     /// The verifier's file.
-    #[arg(long, default_value = "verifier.safetensors")]
+    #[arg(long, default_value = "verifier.safetensors", value_parser = super::output_file)]
     out: PathBuf,
     /// Seed of the split, the first weights and the order of samples.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
@@ -66,7 +66,7 @@ pub struct Arguments {
     #[arg(long)]
     plain: bool,
     /// Also write the figures to this file.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
     /// Publish the verifier under this name to agents that follow it.
     #[arg(long, requires = "connect")]
@@ -152,7 +152,7 @@ fn read(
 
 /// Writes a whole file; a bare name has no folder to write the temporary file into.
 fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    write_whole(&Path::new(".").join(path), bytes)
+    write_whole(path, bytes)
 }
 
 fn options(arguments: &Arguments) -> Result<TrainingOptions> {

@@ -13,7 +13,7 @@ use store::record::{
     CandidateRecord, DecisionRecord, EpisodeIdentity, EpisodeRecord, RECORD_VERSION, StepRecord,
     Versions,
 };
-use store::run::{EpisodeSummary, Run, RunRequest};
+use store::run::{EpisodeSummary, Run, RunRequest, write_video};
 use store::video::Video;
 
 pub const TASKS: [&str; 2] = ["widowx_spoon_on_towel", "widowx_stack_cube"];
@@ -72,7 +72,7 @@ pub fn write(folder: &Path) -> anyhow::Result<()> {
     for record in &mut records {
         record.identity.run.clone_from(&run.header.run);
         if has_video(record) {
-            run.write_video(&record.identity.id(), &video(record)?)?;
+            write_video(&run.folder, &record.identity.id(), &video(record)?)?;
         }
         run.record(record)?;
     }

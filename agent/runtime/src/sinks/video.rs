@@ -3,10 +3,9 @@
 use std::collections::HashMap;
 use std::path::PathBuf;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use protocol::Image;
-use store::record::write_whole;
-use store::run::video_path;
+use store::run::write_video;
 use store::video::Video;
 
 use super::{Event, EventSink};
@@ -32,11 +31,7 @@ impl VideoSink {
 
     fn write(&mut self, id: &str) -> Result<()> {
         let Some(video) = self.running.remove(id) else { return Ok(()) };
-        let path = video_path(&self.folder, id);
-        let folder = path.parent().context("a video has a folder")?;
-        std::fs::create_dir_all(folder)
-            .with_context(|| format!("cannot make {}", folder.display()))?;
-        write_whole(&path, &video.finish()?)
+        write_video(&self.folder, id, &video.finish()?)
     }
 }
 

@@ -25,7 +25,7 @@ use anyhow::Result;
 
 pub use faults::{FaultRecord, faults};
 pub use header::{RunHeader, RunStart, read_header};
-pub use records::{record_path, recorded, video_path};
+pub use records::{record_path, recorded, video_path, write_video};
 pub use summary::EpisodeSummary;
 pub use writer::{Run, RunRequest};
 

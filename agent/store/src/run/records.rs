@@ -7,7 +7,7 @@ use std::thread;
 use anyhow::{Context, Result, bail};
 
 use super::EpisodeSummary;
-use crate::durable::TEMPORARY_PREFIX;
+use crate::durable::{TEMPORARY_PREFIX, write_whole};
 use crate::labels::Label;
 use crate::record::{EpisodeRecord, ReadError};
 
@@ -54,6 +54,14 @@ pub fn record_path(folder: &Path, id: &str) -> PathBuf {
 /// Where the video of an episode is, if there is one.
 pub fn video_path(folder: &Path, id: &str) -> PathBuf {
     folder.join(VIDEOS).join(format!("{id}.mp4"))
+}
+
+/// Keeps the video of an episode. Written before its record, so that whoever finds the record finds the video.
+pub fn write_video(folder: &Path, id: &str, video: &[u8]) -> Result<()> {
+    let videos = folder.join(VIDEOS);
+    std::fs::create_dir_all(&videos)
+        .with_context(|| format!("cannot make {}", videos.display()))?;
+    write_whole(&video_path(folder, id), video)
 }
 
 /// The names of all recorded episodes: what the folder holds, whatever the index says.

@@ -9,11 +9,10 @@ use anyhow::{Context, Result, bail, ensure};
 use rusqlite::Connection;
 use serde_json::Value;
 
-use super::records::{self, EPISODES, Entry, VIDEOS};
+use super::records::{self, EPISODES, Entry};
 use super::{
     EpisodeSummary, FaultRecord, RunHeader, faults, header, index, record_path, video_path,
 };
-use crate::durable::write_whole;
 use crate::labels::{self, LabelStore};
 use crate::provenance::{Build, Provenance};
 use crate::record::EpisodeRecord;
@@ -107,15 +106,6 @@ impl Run {
         Ok(())
     }
 
-    /// Keeps the video of an episode; before its record, so that a record's video is there.
-    pub fn write_video(&self, id: &str, video: &[u8]) -> Result<()> {
-        let path = video_path(&self.folder, id);
-        let folder = self.folder.join(VIDEOS);
-        std::fs::create_dir_all(&folder)
-            .with_context(|| format!("cannot make {}", folder.display()))?;
-        write_whole(&path, video)
-    }
-
     /// Notes an attempt that broke.
     pub fn fault(&self, fault: &FaultRecord) -> Result<()> {
         faults::append(&self.folder, fault)
@@ -124,16 +114,6 @@ impl Run {
     /// All recorded episodes, ordered by name.
     pub fn summaries(&self) -> Result<Vec<EpisodeSummary>> {
         super::summaries(&self.folder)
-    }
-
-    /// The names of all recorded episodes.
-    pub fn recorded(&self) -> Result<BTreeSet<String>> {
-        records::recorded(&self.folder)
-    }
-
-    /// Where videos of this run are.
-    pub fn video_path(&self, id: &str) -> PathBuf {
-        video_path(&self.folder, id)
     }
 
     /// Writes the labels that could not be written before. What is missing when this fails is completed at the next start.

@@ -9,7 +9,8 @@ use super::*;
 use crate::labels::{Label, labels};
 use crate::queue::FaultScope;
 use crate::record::{RecordFile, tests::made_up};
-use crate::run::{faults::FAULTS, index::INDEX, recorded, summaries};
+use crate::run::records::VIDEOS;
+use crate::run::{faults::FAULTS, index::INDEX, recorded, summaries, video_path, write_video};
 
 fn request(folder: &Path) -> RunRequest {
     RunRequest {
@@ -64,7 +65,7 @@ fn a_run_is_resumed_with_what_it_has_and_every_record_says_how_it_came_about() {
     record(&run, 1);
     assert_eq!(episodes(&run.summaries().expect("summaries")), [0, 1]);
     assert_eq!(episodes(&summaries(&run.folder).expect("while it is written")), [0, 1]);
-    assert_eq!(run.recorded().expect("names").len(), 2);
+    assert_eq!(recorded(&run.folder).expect("names").len(), 2);
     let provenance = RecordFile::read(&path).expect("a record").provenance;
     let RunRequest { command, options, build, .. } = request(folder.path());
     assert_eq!(provenance, Provenance { command, options, build });
@@ -108,6 +109,21 @@ fn a_label_is_there_with_its_record_and_neither_without_the_other() {
     run.complete().expect("completed");
     assert_eq!(stored(folder.path()).len(), 3);
     assert_eq!(index::summaries(&run.connection).expect("an index").len(), 3);
+}
+
+#[test]
+fn an_episode_in_which_the_policy_never_acted_is_recorded_without_a_label() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = open(folder.path());
+    let mut record = episode(&run, 0);
+    for decision in record.steps.iter_mut().filter_map(|step| step.decision.as_mut()) {
+        decision.chosen = None;
+    }
+    run.record(&record).expect("recorded");
+    assert_eq!(episodes(&run.summaries().expect("summaries")), [0]);
+    drop(run);
+    drop(open(folder.path()));
+    assert_eq!(stored(folder.path()), []);
 }
 
 #[test]
@@ -288,7 +304,7 @@ fn a_damaged_record_is_set_aside_and_its_episode_is_run_again() {
     std::fs::copy(&paths[4], &paths[3]).expect("damaged");
     let run = open(folder.path());
     assert_eq!(episodes(&run.summaries().expect("summaries")), [4]);
-    assert_eq!(run.recorded().expect("names").len(), 1);
+    assert_eq!(recorded(&run.folder).expect("names").len(), 1);
     assert_eq!(stored(folder.path()).len(), 1, "no label of a record that is gone");
     for aside in &paths[..4] {
         let aside = PathBuf::from(format!("{}.damaged", aside.display()));
@@ -300,7 +316,7 @@ fn a_damaged_record_is_set_aside_and_its_episode_is_run_again() {
     drop(run);
     assert_eq!(summaries(&path).expect("summaries"), expected);
     assert_eq!(
-        open(folder.path()).recorded().expect("names").len(),
+        recorded(&open(folder.path()).folder).expect("names").len(),
         5,
         "what is aside stays there"
     );
@@ -326,7 +342,7 @@ fn a_record_of_another_run_is_refused() {
     let error = run.record(&made_up(0)).expect_err("another run").to_string();
     assert!(error.contains("expected a record of the run run-"), "{error}");
     assert!(error.ends_with("got made-up"), "{error}");
-    assert!(run.recorded().expect("names").is_empty());
+    assert!(recorded(&run.folder).expect("names").is_empty());
 }
 
 #[test]
@@ -360,7 +376,7 @@ fn what_a_killed_process_left_unfinished_is_nothing() {
     };
     run.fault(&fault).expect("noted");
     let path = run.folder.clone();
-    run.write_video("a", b"a film").expect("written");
+    write_video(&path, "a", b"a film").expect("written");
     drop(run);
     let unfinished = ["", EPISODES, VIDEOS].map(|folder| path.join(folder).join(".tmpabc"));
     for half in &unfinished {
@@ -374,7 +390,7 @@ fn what_a_killed_process_left_unfinished_is_nothing() {
     append(b"{\"identity\": {");
     let run = open(folder.path());
     assert!(!unfinished.iter().any(|half| half.exists()));
-    assert_eq!(std::fs::read(run.video_path("a")).expect("a video"), b"a film");
+    assert_eq!(std::fs::read(video_path(&path, "a")).expect("a video"), b"a film");
     assert_eq!(faults::faults(&path).expect("faults"), std::slice::from_ref(&fault));
     run.fault(&fault).expect("noted");
     drop(run);
