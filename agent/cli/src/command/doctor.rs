@@ -3,17 +3,17 @@
 //! It changes nothing on the machine: what is missing is named with the line that installs it.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, ensure};
 use clap::Args;
 use decision::{ActionSpace, Image, Policy, ProposalRequest};
 use protocol::{Open, PROTOCOL_VERSION, Reset};
 use runtime::servers::{
-    Host, Installation, LocalSource, Missing, PythonEnvironment, ServerProgram, ServerSource,
-    Simulator,
+    Deployment, Host, Installation, LocalSource, Missing, PythonEnvironment, ServerProgram,
+    ServerSource, Simulator,
 };
-use runtime::wire::{Environment, Network, ServerDescription};
+use runtime::wire::{Environment, ServerDescription};
 use serde::Serialize;
 use store::plan::SeedRange;
 use verifier::Verifier;
@@ -22,8 +22,6 @@ use vla::{DeviceName, Vla};
 use super::names::{FLEET_DEFAULT, endpoint, fleet};
 use crate::files;
 
-/// A server must be found within this time of its start.
-const SERVER_WAIT: Duration = Duration::from_secs(30);
 /// The image size where there is no policy that asks for another.
 const IMAGE_SIZE_DEFAULT: (usize, usize) = (128, 128);
 
@@ -194,22 +192,19 @@ fn check_environment(
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-    let network = runtime.block_on(Network::open(source.network_options()))?;
-    let local = program.map(|program| source.start(program, &network, 1)).transpose()?;
-    let result = runtime.block_on(try_environment(&network, image_size));
-    drop(local);
-    runtime.block_on(network.close())?;
+    let deployment = source.open_with(program, &runtime, 1)?;
+    let result = runtime.block_on(try_environment(&deployment, image_size));
+    deployment.close(&runtime)?;
     result
 }
 
 async fn try_environment(
-    network: &Network,
+    deployment: &Deployment,
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {
-    let servers = network.servers(1, SERVER_WAIT).await.servers;
-    let server = servers.values().next().context(
-        "no environment server found: start one with `python -m rever_env serve`, or check --connect and --fleet",
-    )?;
+    let network = &deployment.network;
+    let servers = deployment.first_servers().await?.servers;
+    let server = servers.values().next().context("no environment server found")?;
     let task = server.tasks.first().context("the server offers no task")?;
     let open = Open {
         protocol: PROTOCOL_VERSION,

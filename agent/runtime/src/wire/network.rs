@@ -17,8 +17,8 @@ use super::local_endpoint::{ANY_LOOPBACK_PORT, local_endpoint};
 const PORT_ATTEMPTS_MAX: usize = 10;
 /// A client waits this long for the router or server that it is told to connect to.
 const CLIENT_WAIT_MS: u32 = 30_000;
-/// Of one network with a few servers: sockets, epoll's, pipes of the servers.
-const OPEN_FILES_MIN: u64 = 32;
+/// For zenoh's threads and sockets and a few servers' pipes.
+const OPEN_FILES_MIN: u64 = 64;
 
 /// Where the network lies. Nothing is opened that is not named here.
 #[derive(Debug, Clone)]
