@@ -170,6 +170,30 @@ fn the_native_simulator_says_where_it_is_built() {
 }
 
 #[test]
+fn too_few_open_files_are_named() {
+    let copied = Copied::new();
+    let program = copied.command();
+    let program = Path::new(program.get_program()).display();
+    let line = format!("ulimit -n 24; exec {program} doctor --connect tcp/127.0.0.1:9");
+    let mut shell = Command::new("sh");
+    shell.args(["-c", &line]).current_dir(copied.path("work")).env("HOME", copied.path("home"));
+    let output = run(&mut shell);
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("a limit of at least 64 open files, got 24, see `ulimit -n`"), "{said}");
+}
+
+#[test]
+fn an_endpoint_that_cannot_be_used_is_wrong_usage() {
+    for endpoint in ["tls/localhost:7447", "tcp/localhost", "localhost:7447"] {
+        let output = run(rever().args(["evaluate", "--connect", endpoint]));
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains("expected tcp/HOST:PORT or unixsock-stream/PATH"), "{said}");
+    }
+}
+
+#[test]
 fn too_little_memory_for_a_server_is_named() {
     let copied = Copied::new();
     let program = copied.command();

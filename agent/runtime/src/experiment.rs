@@ -21,8 +21,6 @@ use crate::sinks::{EventSink, OutcomeSink, Progress, Sinks, StoreSink, VideoSink
 use crate::stop::{self, Stop};
 use crate::wire::{Fleet, OutcomePublisher, PoolOptions, VerifierSubscriber, ZenohPool};
 
-/// Discovery timeout for servers that are already running.
-const SERVERS_WAIT: Duration = Duration::from_secs(10);
 /// After some of them have been found: a fleet may have servers of other tasks, which answered first.
 const OTHERS_WAIT: Duration = Duration::from_secs(2);
 /// A run that needs a verifier and follows one waits this long for the first.
@@ -172,7 +170,7 @@ impl Experiment {
     /// A task that nobody offers would break every one of its episodes.
     async fn check_tasks(&self, deployment: &Deployment) -> Result<()> {
         let wanted: BTreeSet<&TaskId> = self.plans.iter().map(|plan| &plan.task).collect();
-        let mut fleet = first_servers(deployment).await?;
+        let mut fleet = deployment.first_servers().await?;
         if !wanted.is_subset(&offered(&fleet).iter().collect()) {
             fleet = deployment.network.servers(fleet.servers.len() + 1, OTHERS_WAIT).await;
         }
@@ -250,7 +248,7 @@ pub fn pool_options(policy: &PolicyInfo, holder: String, simulator: Option<Strin
 
 /// The tasks that servers offer in their default variant, in the order of their descriptions.
 pub async fn default_tasks(deployment: &Deployment) -> Result<Vec<TaskId>> {
-    let fleet = first_servers(deployment).await?;
+    let fleet = deployment.first_servers().await?;
     let mut tasks: Vec<TaskId> = Vec::new();
     for offer in fleet.servers.values().flat_map(|server| &server.tasks) {
         let task = TaskId::new(&offer.task, &offer.variant);
@@ -260,24 +258,6 @@ pub async fn default_tasks(deployment: &Deployment) -> Result<Vec<TaskId>> {
     }
     ensure!(!tasks.is_empty(), "tasks: expected --tasks, for no server offers a default variant");
     Ok(tasks)
-}
-
-/// The servers that are found within the discovery timeout; an error when there is none.
-async fn first_servers(deployment: &Deployment) -> Result<Fleet> {
-    let Deployment { source, network, .. } = deployment;
-    let fleet = network.servers(source.local_count().max(1), SERVERS_WAIT).await;
-    if !fleet.servers.is_empty() {
-        return Ok(fleet);
-    }
-    let place = match &source.connect[..] {
-        [] => String::new(),
-        connect => format!(" at {}", connect.join(", ")),
-    };
-    let mut text = format!("no environment server found{place} (fleet {:?})", source.fleet);
-    for (server, reason) in &fleet.undescribed {
-        text.push_str(&format!("; server {server}: {reason}"));
-    }
-    bail!(text)
 }
 
 /// Every task in every variant that some server offers.

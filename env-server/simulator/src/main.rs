@@ -27,6 +27,7 @@ mod trace;
 mod world;
 mod worlds;
 
+use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -64,6 +65,7 @@ fn main() -> ExitCode {
     let program = Program::parse();
     tracing_subscriber::fmt()
         .with_env_filter(EnvFilter::new(LOG_FILTER))
+        .with_ansi(std::io::stderr().is_terminal())
         .with_writer(std::io::stderr)
         .with_target(false)
         .init();

@@ -8,6 +8,7 @@ use std::thread;
 
 use anyhow::{Context, Result};
 use bytes::Bytes;
+use protocol::transport;
 use zenoh::Wait;
 use zenoh::pubsub::Publisher;
 use zenoh::query::Query;
@@ -42,7 +43,7 @@ impl Outbox {
         let send = move || {
             while let Some(reply) = sent.wait() {
                 if let Err(error) = publisher.put(reply).wait() {
-                    tracing::warn!("a reply was not sent: {error}");
+                    tracing::warn!("a reply was not sent: {}", transport::in_words(error));
                 }
             }
         };
@@ -124,7 +125,7 @@ impl Answers {
         let answering = Arc::clone(&self.answering);
         let answer = move || {
             if let Err(error) = query.reply(key, bytes).wait() {
-                tracing::warn!("a query was not answered: {error}");
+                tracing::warn!("a query was not answered: {}", transport::in_words(error));
             }
             drop(query);
             answering.fetch_sub(1, Ordering::Relaxed);

@@ -8,6 +8,7 @@ use clap::Args;
 use conformance::{Row, Verdict, test};
 use runtime::servers::{Host, LocalSource, ServerSource, Simulator};
 
+use super::names::{FLEET_DEFAULT, endpoint, fleet};
 use crate::files;
 
 /// Test a server against the protocol's specification, row by row
@@ -17,10 +18,10 @@ pub struct Arguments {
     #[arg(long, value_enum, conflicts_with = "connect")]
     server: Option<Simulator>,
     /// Test a server that is running: its endpoint or a router's, as tcp/HOST:PORT
-    #[arg(long, value_delimiter = ',')]
+    #[arg(long, value_delimiter = ',', value_parser = endpoint)]
     connect: Vec<String>,
     /// Namespace: peers see each other only within the same fleet
-    #[arg(long, default_value = "local")]
+    #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
     /// This server, when there are several [default: the first]
     #[arg(long)]

@@ -3,26 +3,25 @@
 //! It changes nothing on the machine: what is missing is named with the line that installs it.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, ensure};
 use clap::Args;
 use decision::{ActionSpace, Image, Policy, ProposalRequest};
 use protocol::{Open, PROTOCOL_VERSION, Reset};
 use runtime::servers::{
-    Host, LocalSource, Missing, PythonEnvironment, ServerProgram, ServerSource, Simulator,
+    Deployment, Host, Installation, LocalSource, Missing, PythonEnvironment, ServerProgram,
+    ServerSource, Simulator,
 };
-use runtime::wire::{Environment, Network, ServerDescription};
+use runtime::wire::{Environment, ServerDescription};
 use serde::Serialize;
 use store::plan::SeedRange;
 use verifier::Verifier;
 use vla::{DeviceName, Vla};
 
-use super::episodes::FLEET_DEFAULT;
+use super::names::{FLEET_DEFAULT, endpoint, fleet};
 use crate::files;
 
-/// A server must be found within this time of its start.
-const SERVER_WAIT: Duration = Duration::from_secs(30);
 /// The image size where there is no policy that asks for another.
 const IMAGE_SIZE_DEFAULT: (usize, usize) = (128, 128);
 
@@ -39,10 +38,10 @@ pub struct Arguments {
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
     simulator: Simulator,
     /// Check servers that are running instead of one started here
-    #[arg(long, value_delimiter = ',')]
+    #[arg(long, value_delimiter = ',', value_parser = endpoint)]
     connect: Vec<String>,
     /// Namespace: peers see each other only within the same fleet
-    #[arg(long, default_value = FLEET_DEFAULT)]
+    #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
     /// A Python that has the packages of env-server, instead of the one that rever sets up
     #[arg(long, value_name = "FILE")]
@@ -71,7 +70,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             count: 1,
             simulator: arguments.simulator,
             python: arguments.python,
-            installation,
+            installation: installation.clone(),
         }),
         connect: arguments.connect,
         listen: Vec::new(),
@@ -85,7 +84,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             program = check(&mut findings, "simulator", || check_simulator(local));
         }
     }
-    let policy = check(&mut findings, "policy", || check_policy(&folder));
+    let policy = check(&mut findings, "policy", || check_policy(&folder, &installation));
     if let Some(policy) = &policy {
         let beside = folder.join("verifier.safetensors");
         let named = arguments.verifier.as_deref();
@@ -93,7 +92,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             println!("none  verifier    `rever collect` and `rever train` make one");
         } else {
             let path = named.unwrap_or(&beside);
-            check(&mut findings, "verifier", || check_verifier(path, policy));
+            check(&mut findings, "verifier", || check_verifier(path, &installation, policy));
         }
     }
     if program.is_some() || source.local.is_none() {
@@ -158,13 +157,13 @@ fn check_simulator(local: &LocalSource) -> Result<(ServerProgram, String)> {
     Ok((program, text))
 }
 
-fn check_policy(folder: &Path) -> Result<(Vla, String)> {
+fn check_policy(folder: &Path, installation: &Installation) -> Result<(Vla, String)> {
     let begun = Instant::now();
     let policy = Vla::load(folder, DeviceName::Cpu)?;
     let (height, width) = policy.info().image_size;
     let text = format!(
-        "{} loaded in {} ms: digest {}, images {height} x {width}, hidden state {}",
-        folder.display(),
+        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden state {}",
+        place(folder, installation),
         begun.elapsed().as_millis(),
         short(policy.parser().digest()),
         policy.parser().hidden_size()
@@ -172,9 +171,18 @@ fn check_policy(folder: &Path) -> Result<(Vla, String)> {
     Ok((policy, text))
 }
 
-fn check_verifier(path: &Path, policy: &Vla) -> Result<((), String)> {
+fn check_verifier(path: &Path, installation: &Installation, policy: &Vla) -> Result<((), String)> {
     let verifier = Verifier::load(path, policy.parser().digest())?;
-    Ok(((), format!("{}: digest {}, fits the policy", path.display(), short(verifier.digest()))))
+    let place = place(path, installation);
+    Ok(((), format!("{place}: digest {}, fits the policy", short(verifier.digest()))))
+}
+
+/// Files that were unpacked for this command alone are nowhere when it has ended.
+fn place(path: &Path, installation: &Installation) -> String {
+    match path.strip_prefix(&installation.root) {
+        Ok(name) if installation.is_temporary() => format!("embedded {}", name.display()),
+        _ => path.display().to_string(),
+    }
 }
 
 /// Opens the network, finds a server, resets an environment and steps it once.
@@ -184,22 +192,19 @@ fn check_environment(
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-    let network = runtime.block_on(Network::open(source.network_options()))?;
-    let local = program.map(|program| source.start(program, &network, 1)).transpose()?;
-    let result = runtime.block_on(try_environment(&network, image_size));
-    drop(local);
-    runtime.block_on(network.close())?;
+    let deployment = source.open_with(program, &runtime, 1)?;
+    let result = runtime.block_on(try_environment(&deployment, image_size));
+    deployment.close(&runtime)?;
     result
 }
 
 async fn try_environment(
-    network: &Network,
+    deployment: &Deployment,
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {
-    let servers = network.servers(1, SERVER_WAIT).await.servers;
-    let server = servers.values().next().context(
-        "no environment server found: start one with `python -m rever_env serve`, or check --connect and --fleet",
-    )?;
+    let network = &deployment.network;
+    let servers = deployment.first_servers().await?.servers;
+    let server = servers.values().next().context("no environment server found")?;
     let task = server.tasks.first().context("the server offers no task")?;
     let open = Open {
         protocol: PROTOCOL_VERSION,

@@ -21,12 +21,11 @@ use verifier::Verifier;
 use vla::{DeviceName, Vla};
 
 use super::WrongUsage;
+use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use crate::{build_info, files};
 
 /// Processes on this machine unless others are named.
 const SERVERS_DEFAULT: u16 = 2;
-/// The fleet of those that name none.
-pub const FLEET_DEFAULT: &str = "local";
 /// Episodes at once: enough that a matrix product is worth reading its weights.
 const SESSIONS_DEFAULT: u16 = 16;
 /// The label store of those that name none.
@@ -51,7 +50,7 @@ pub struct EpisodesArguments {
     #[arg(long)]
     pub verifier: Option<PathBuf>,
     /// Follow a published verifier: take up its newest version between episodes.
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = names::verifier)]
     pub follow_verifier: Option<String>,
     /// Server processes to start on this machine [default: 2].
     #[arg(long, conflicts_with = "connect", value_parser = clap::value_parser!(u16).range(1..=64))]
@@ -60,13 +59,13 @@ pub struct EpisodesArguments {
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
     pub simulator: Simulator,
     /// Use servers that are running: endpoints of them or of a router, as tcp/HOST:PORT.
-    #[arg(long, value_delimiter = ',')]
+    #[arg(long, value_delimiter = ',', value_parser = endpoint)]
     pub connect: Vec<String>,
     /// Listen here for others, such as a trainer that publishes verifiers [default: a socket of this machine, printed at the start].
-    #[arg(long, value_name = "ENDPOINT", value_delimiter = ',')]
+    #[arg(long, value_name = "ENDPOINT", value_delimiter = ',', value_parser = endpoint)]
     pub listen: Vec<String>,
     /// Namespace: peers see each other only within the same fleet.
-    #[arg(long, default_value = FLEET_DEFAULT)]
+    #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     pub fleet: String,
     /// Episodes at once.
     #[arg(long, default_value_t = SESSIONS_DEFAULT, value_parser = clap::value_parser!(u16).range(1..=256))]
@@ -197,9 +196,6 @@ impl EpisodesArguments {
             bail!(WrongUsage(format!(
                 "strategy {strategy}: expected a verifier (--verifier FILE), got none"
             )));
-        }
-        for name in [Some(&self.fleet), self.follow_verifier.as_ref()].into_iter().flatten() {
-            protocol::Keys::new(name).map_err(|error| WrongUsage(error.to_string()))?;
         }
         // Made, if there is none, before anything is run for it.
         LabelStore::open(&self.labels).map(drop)

@@ -8,10 +8,12 @@ mod digest;
 mod doctor;
 mod episodes;
 mod evaluate;
+mod names;
 mod report;
 mod train;
 
 use std::fmt;
+use std::io::IsTerminal;
 use std::path::PathBuf;
 
 use anyhow::Result;
@@ -63,7 +65,11 @@ impl Program {
 /// Sends the log to standard error; `filter` is in the form of `tracing` and replaces the default.
 pub fn start_log(filter: Option<&str>) {
     let filter = EnvFilter::new(filter.unwrap_or(LOG_FILTER_DEFAULT));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(std::io::stderr)
+        .init();
 }
 
 /// The command line asks for something that there is not; found out before anything was started.

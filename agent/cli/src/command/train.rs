@@ -18,7 +18,7 @@ use verifier::{
 };
 use vla::CompletionParser;
 
-use super::episodes::FLEET_DEFAULT;
+use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use crate::files::policy_folder;
 
 /// How long to look for agents that follow the verifier before it is published to nobody yet.
@@ -69,13 +69,13 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
     /// Publish the verifier under this name to agents that follow it.
-    #[arg(long, requires = "connect")]
+    #[arg(long, requires = "connect", value_parser = names::verifier)]
     name: Option<String>,
     /// Router or agent to publish through, as tcp/HOST:PORT.
-    #[arg(long, requires = "name")]
+    #[arg(long, requires = "name", value_parser = endpoint)]
     connect: Vec<String>,
     /// Namespace: peers see each other only within the same fleet.
-    #[arg(long, default_value = FLEET_DEFAULT)]
+    #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
     /// After publishing, stay until Ctrl-C so that agents that start later get the verifier too.
     #[arg(long, requires = "name")]

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use tokio::runtime::Runtime;
 
 use super::installation::{Installation, Missing};
@@ -14,8 +14,10 @@ use super::program::{ServerProgram, Simulator};
 use super::python::{
     PythonEnvironment, named_environment, servers_environment, simulators_environment,
 };
-use crate::wire::{Network, NetworkOptions};
+use crate::wire::{Fleet, Network, NetworkOptions};
 
+/// Discovery timeout for servers that are already running.
+const SERVERS_WAIT: Duration = Duration::from_secs(10);
 /// A server may need nearly as long to open a session. One with episodes is found to be frozen much earlier, by the
 /// requests that it does not answer.
 const SILENCE_MAX: Duration = Duration::from_secs(60);
@@ -57,6 +59,28 @@ pub struct Deployment {
 }
 
 impl Deployment {
+    /// The servers that are found in time; an error when there is none.
+    pub async fn first_servers(&self) -> Result<Fleet> {
+        let local = self.local.as_ref().map_or(0, |local| local.server_ids().len());
+        let fleet = self.network.servers(local.max(1), SERVERS_WAIT).await;
+        if !fleet.servers.is_empty() {
+            return Ok(fleet);
+        }
+        if let Some(reason) = self.local.as_ref().and_then(|local| local.given_up()) {
+            bail!("{reason}");
+        }
+        let place = match &self.source.connect[..] {
+            [] => String::new(),
+            connect => format!(" at {}", connect.join(", ")),
+        };
+        let mut text =
+            format!("no environment server found{place} (fleet {:?})", self.source.fleet);
+        for (server, reason) in &fleet.undescribed {
+            text.push_str(&format!("; server {server}: {reason}"));
+        }
+        bail!(text)
+    }
+
     /// Ends the local servers, then the network. Blocks.
     pub fn close(self, runtime: &Runtime) -> Result<()> {
         // Servers first: they would report the network's end as an error.
@@ -71,6 +95,16 @@ impl ServerSource {
     pub fn open(&self, runtime: &Runtime, sessions: usize) -> Result<Deployment> {
         let local = self.local.as_ref();
         let program = local.map(|local| local.program(Missing::Install)).transpose()?;
+        self.open_with(program, runtime, sessions)
+    }
+
+    /// The same with the program of local servers, which is there.
+    pub fn open_with(
+        &self,
+        program: Option<ServerProgram>,
+        runtime: &Runtime,
+        sessions: usize,
+    ) -> Result<Deployment> {
         let network = runtime.block_on(Network::open(self.network_options()))?;
         let local = program.map(|program| self.start(program, &network, sessions)).transpose()?;
         Ok(Deployment { source: self.clone(), network, local: local.map(Arc::new) })

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, anyhow, ensure};
 use protocol::{Keys, transport};
+use rustix::process::{Resource, getrlimit};
 use tempfile::TempDir;
 use zenoh::Session;
 
@@ -16,6 +17,8 @@ use super::local_endpoint::{ANY_LOOPBACK_PORT, local_endpoint};
 const PORT_ATTEMPTS_MAX: usize = 10;
 /// A client waits this long for the router or server that it is told to connect to.
 const CLIENT_WAIT_MS: u32 = 30_000;
+/// For zenoh's threads and sockets and a few servers' pipes.
+const OPEN_FILES_MIN: u64 = 64;
 
 /// Where the network lies. Nothing is opened that is not named here.
 #[derive(Debug, Clone)]
@@ -96,6 +99,7 @@ impl Network {
     /// Opens the session. Needs a tokio runtime with several threads.
     pub async fn open(options: NetworkOptions) -> anyhow::Result<Self> {
         let keys = Keys::new(&options.fleet)?;
+        ensure_open_files()?;
         options
             .connect
             .iter()
@@ -161,6 +165,16 @@ impl Network {
             .await
             .map_err(|error| anyhow!("cannot close the network: {}", transport::in_words(error)))
     }
+}
+
+/// With fewer, zenoh panics.
+fn ensure_open_files() -> anyhow::Result<()> {
+    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    ensure!(
+        limit >= OPEN_FILES_MIN,
+        "expected a limit of at least {OPEN_FILES_MIN} open files, got {limit}, see `ulimit -n`"
+    );
+    Ok(())
 }
 
 /// An error for an endpoint that this program has no transport for; zenoh would try it for as long as it may.
