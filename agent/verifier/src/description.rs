@@ -2,6 +2,7 @@
 //!
 //! The aliases are the names in files of the first format, which stay readable.
 
+use anyhow::ensure;
 use serde::{Deserialize, Serialize};
 
 use crate::Metrics;
@@ -101,6 +102,49 @@ pub struct TrainingOptions {
     /// while all later ones drift on; a gripper that is led by every decision keeps what it has gained.
     #[serde(alias = "aim_factor")]
     pub target_factor: f64,
+}
+
+impl TrainingOptions {
+    /// Refuses options that no training can follow.
+    pub fn check(&self) -> anyhow::Result<()> {
+        let TrainingOptions { hidden_sizes, epochs_max, batch_samples, learning_rate, .. } = self;
+        let TrainingOptions { validation_share, held_out_share, .. } = self;
+        let TrainingOptions { advantage_decay, ranking_ridge, target_factor, .. } = self;
+        ensure!(
+            hidden_sizes.iter().all(|size| (1..=4096).contains(size)),
+            "hidden sizes: expected 1 to 4096, got {hidden_sizes:?}"
+        );
+        ensure!((1..=10_000).contains(epochs_max), "epochs: expected 1 to 10000, got {epochs_max}");
+        ensure!(*batch_samples > 0, "batch: expected at least 1 sample, got 0");
+        ensure!(
+            learning_rate.is_finite() && *learning_rate > 0.0,
+            "learning rate: expected more than 0, got {learning_rate}"
+        );
+        for (name, share) in [("validation", validation_share), ("held-out", held_out_share)] {
+            ensure!(
+                *share > 0.0 && *share < 1.0,
+                "{name} share: expected between 0 and 1, got {share}"
+            );
+        }
+        ensure!(
+            validation_share + held_out_share < 1.0,
+            "validation and held-out share: expected less than 1 together, got {}",
+            validation_share + held_out_share
+        );
+        ensure!(
+            (0.0..=1.0).contains(advantage_decay),
+            "advantage decay: expected 0 to 1, got {advantage_decay}"
+        );
+        ensure!(
+            ranking_ridge.is_finite() && *ranking_ridge > 0.0,
+            "ranking ridge: expected more than 0, got {ranking_ridge}"
+        );
+        ensure!(
+            target_factor.is_finite() && *target_factor >= 0.0,
+            "target factor: expected 0 or more, got {target_factor}"
+        );
+        Ok(())
+    }
 }
 
 impl Default for TrainingOptions {

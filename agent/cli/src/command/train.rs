@@ -12,12 +12,13 @@ use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
 use serde::Serialize;
 use store::write_whole;
 use verifier::training::records::{self, CompletionReader, Excluded};
-use verifier::training::{Epoch, TrainingEpisode, TrainingSet, train};
+use verifier::training::{EPISODES_MIN, Epoch, TrainingEpisode, TrainingSet, train};
 use verifier::{
     Discrimination, Metrics, ReRankingGain, TrainingOptions, Verifier, VerifierDescription,
 };
 use vla::CompletionParser;
 
+use super::WrongUsage;
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use crate::files::policy_folder;
 
@@ -101,6 +102,8 @@ struct ResultFile<'a> {
 /// Trains, prints, writes, publishes.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let started = Instant::now();
+    let options = options(&arguments)?;
+    options.check().map_err(|error| WrongUsage(error.to_string()))?;
     let parser = CompletionParser::load(&policy_folder(arguments.policy.as_ref(), host)?)?;
     let action_space = parser.action_space();
     let (episodes, excluded) = read(&arguments, &parser, &action_space)?;
@@ -112,11 +115,11 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let set = TrainingSet::new(parser.hidden_size(), action_space.length(), episodes)?;
     let (count, repeats) = (set.episodes().len(), set.repeats());
     eprintln!("{count} episodes, {repeats} repeats left out, excluded: {}", counts(&excluded));
-    let options = options(&arguments)?;
     let verifier = train(&set, parser.digest(), &options, |epoch| report(epoch, &options))?;
-    write(&arguments.out, verifier.bytes())?;
+    write_whole(&arguments.out, verifier.bytes())?;
     print!("{}", table(&verifier));
-    println!("written to {}", arguments.out.display());
+    let out = arguments.out.display();
+    println!("written to {out}");
     if let Some(json) = &arguments.json {
         let result = ResultFile {
             verifier: verifier.digest(),
@@ -125,8 +128,9 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             excluded: &excluded,
             wall_secs: started.elapsed().as_secs_f64(),
         };
-        write(json, &serde_json::to_vec_pretty(&result)?)?;
+        write_whole(json, &serde_json::to_vec_pretty(&result)?)?;
     }
+    println!("next: rever evaluate --strategies sample,verifier --verifier {out}");
     match &arguments.name {
         Some(name) => publish(&arguments, name, &verifier),
         None => Ok(()),
@@ -148,11 +152,6 @@ fn read(
         return records::from_labels(&arguments.labels, reader);
     }
     records::from_runs(&arguments.runs, reader)
-}
-
-/// Writes a whole file; a bare name has no folder to write the temporary file into.
-fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    write_whole(path, bytes)
 }
 
 fn options(arguments: &Arguments) -> Result<TrainingOptions> {
@@ -241,8 +240,9 @@ fn table(verifier: &Verifier) -> String {
 /// The gain of the ranking beside that of the medoid, from re-ranking single decisions.
 fn ranking_text(verifier: &Verifier) -> String {
     let Some(ranking) = &verifier.description().ranking else {
-        return "no ranking of candidates: it needs `rever collect --candidates 5` and no --plain\n"
-            .to_owned();
+        return format!(
+            "no ranking of candidates: it needs {EPISODES_MIN} training and validation episodes of `rever collect --candidates 5`, and no --plain\n"
+        );
     };
     let gain = |gain: &ReRankingGain| {
         format!("{:+.1} ± {:.1}", gain.percentage_points, gain.standard_error)

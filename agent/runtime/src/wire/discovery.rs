@@ -106,7 +106,7 @@ impl Discovery {
         while !session.is_closed() {
             changed.mark_unchanged();
             let alive = self.alive();
-            self.forget_all_but(&alive);
+            self.forget(|server| alive.contains(server));
             retries.retain(|server, _| alive.contains(server));
             let described = self.fleet.borrow().servers.clone();
             for server in &alive {
@@ -165,11 +165,11 @@ impl Discovery {
         }
     }
 
-    fn forget_all_but(&self, alive: &HashSet<String>) {
+    fn forget(&self, stays: impl Fn(&str) -> bool) {
         self.fleet.send_if_modified(|fleet| {
             let before = fleet.servers.len() + fleet.undescribed.len();
-            fleet.servers.retain(|server, _| alive.contains(server));
-            fleet.undescribed.retain(|server, _| alive.contains(server));
+            fleet.servers.retain(|server, _| stays(server));
+            fleet.undescribed.retain(|server, _| stays(server));
             fleet.servers.len() + fleet.undescribed.len() != before
         });
     }
@@ -186,6 +186,10 @@ impl Discovery {
     fn on_token(&self, keys: &Keys, sample: &Sample) {
         let Some(server) = keys.server_of(sample.key_expr().as_str()) else { return };
         let alive = sample.kind() == SampleKind::Put;
+        if !alive {
+            // Before its status, so that whoever learns of the loss no longer finds it in the fleet.
+            self.forget(|name| name != server);
+        }
         self.update(server, |status| {
             status.losses += u32::from(status.alive && !alive);
             std::mem::replace(&mut status.alive, alive) != alive

@@ -10,9 +10,7 @@ use rusqlite::Connection;
 use serde_json::Value;
 
 use super::records::{self, EPISODES, Entry};
-use super::{
-    EpisodeSummary, FaultRecord, RunHeader, faults, header, index, record_path, video_path,
-};
+use super::{EpisodeSummary, FaultRecord, RunHeader, faults, header, index, record_path};
 use crate::labels::{self, LabelStore};
 use crate::provenance::{Build, Provenance};
 use crate::record::EpisodeRecord;

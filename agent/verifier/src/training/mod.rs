@@ -32,6 +32,7 @@ use rand_chacha::ChaCha8Rng;
 
 pub use decision_sample::{DecisionSample, STATISTICS};
 pub use eligibility::{ExclusionReason, exclude_label, exclude_record};
+pub use ranking::EPISODES_MIN;
 pub use set::{LayoutKey, TrainingEpisode, TrainingSet};
 pub use split::Split;
 
@@ -64,7 +65,7 @@ pub fn train(
     options: &TrainingOptions,
     progress: impl FnMut(Epoch),
 ) -> anyhow::Result<Verifier> {
-    check(options)?;
+    options.check()?;
     let split = set.split(options.validation_share, options.held_out_share, options.seed);
     let data = data(set, &split)?;
     let labels = set.labels(&split.training);
@@ -136,46 +137,6 @@ fn fit(
     }
     let (epochs, _, network) = best.context("no epoch was run")?;
     Ok((epochs, network))
-}
-
-fn check(options: &TrainingOptions) -> anyhow::Result<()> {
-    let TrainingOptions { hidden_sizes, epochs_max, batch_samples, learning_rate, .. } = options;
-    let TrainingOptions { validation_share, held_out_share, .. } = options;
-    let TrainingOptions { advantage_decay, ranking_ridge, target_factor, .. } = options;
-    ensure!(
-        hidden_sizes.iter().all(|size| (1..=4096).contains(size)),
-        "hidden sizes: expected 1 to 4096, got {hidden_sizes:?}"
-    );
-    ensure!((1..=10_000).contains(epochs_max), "epochs: expected 1 to 10000, got {epochs_max}");
-    ensure!(*batch_samples > 0, "batch: expected at least 1 sample, got 0");
-    ensure!(
-        learning_rate.is_finite() && *learning_rate > 0.0,
-        "learning rate: expected more than 0, got {learning_rate}"
-    );
-    for (name, share) in [("validation", validation_share), ("held-out", held_out_share)] {
-        ensure!(
-            *share > 0.0 && *share < 1.0,
-            "{name} share: expected between 0 and 1, got {share}"
-        );
-    }
-    ensure!(
-        validation_share + held_out_share < 1.0,
-        "validation and held-out share: expected less than 1 together, got {}",
-        validation_share + held_out_share
-    );
-    ensure!(
-        (0.0..=1.0).contains(advantage_decay),
-        "advantage decay: expected 0 to 1, got {advantage_decay}"
-    );
-    ensure!(
-        ranking_ridge.is_finite() && *ranking_ridge > 0.0,
-        "ranking ridge: expected more than 0, got {ranking_ridge}"
-    );
-    ensure!(
-        target_factor.is_finite() && *target_factor >= 0.0,
-        "target factor: expected 0 or more, got {target_factor}"
-    );
-    Ok(())
 }
 
 /// Counts the sides of the split; each needs successes and failures, or there is nothing to tell apart.

@@ -19,8 +19,8 @@ use crate::{
 
 /// Parts of the episodes, of which each is judged by what was fitted to the others.
 const FOLDS: usize = 5;
-/// Fewer episodes say nothing about single decisions.
-const EPISODES_MIN: usize = 20;
+/// No ranking is fitted to fewer episodes: they say nothing about single decisions.
+pub const EPISODES_MIN: usize = 20;
 /// A feature that varies less carries nothing.
 const SCALE_MIN: f64 = 1e-6;
 
