@@ -179,6 +179,7 @@ async fn a_stuck_simulation_times_out_though_its_token_stands() {
     let network = connect_through(&endpoint, timing).await;
     let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
     let mut episode = environment.reset(spoon()).await.expect("an episode");
+    episode.step(&[0.0; 7]).await.expect("a step, for the first may take longer");
     relay.get_stuck();
     let fault = episode.step(&[0.0; 7]).await.expect_err("nothing passes");
     let EnvironmentFault::TimedOut { asked: "Step", waited_secs: 3..=10, .. } = fault else {

@@ -16,6 +16,8 @@ pub struct PolicyInfo {
     pub action_space: ActionSpace,
     /// Length of a candidate's hidden state; none where the policy tells none.
     pub hidden_size: Option<usize>,
+    /// Calls of [`Policy::propose`] that it computes side by side; 1 where a larger batch costs hardly more than a small one.
+    pub parallel_calls: usize,
 }
 
 /// Proposes candidates. What a request gets must not depend on the requests beside it.

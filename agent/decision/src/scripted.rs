@@ -38,6 +38,7 @@ impl ScriptedPolicy {
                 image_size: (0, 0),
                 action_space: ActionSpace { scale: vec![1.0; 7], gripper: Some(6) },
                 hidden_size: Some(1),
+                parallel_calls: 1,
             },
             answers: Mutex::default(),
             batches: Mutex::default(),

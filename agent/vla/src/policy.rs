@@ -42,13 +42,15 @@ impl Vla {
                 digest = parser.digest(),
                 "policy loaded"
             );
+            let pools = WorkerPools::new(backend)?;
             let info = PolicyInfo {
                 digest: parser.digest().to_owned(),
                 image_size: (parser.config.image_size, parser.config.image_size),
                 action_space: parser.action_space(),
                 hidden_size: Some(parser.hidden_size()),
+                parallel_calls: pools.count().max(1),
             };
-            Ok(Vla { parser, network, pools: WorkerPools::new(backend)?, info })
+            Ok(Vla { parser, network, pools, info })
         };
         load().with_context(|| format!("cannot load the policy in {}", directory.display()))
     }
@@ -170,7 +172,7 @@ impl Policy for Vla {
         &self.info
     }
 
-    /// Computes in the calling thread and on all cores.
+    /// Computes in the calling thread and on all cores, or on one core beside other calls.
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
         self.propose_now(requests)
     }

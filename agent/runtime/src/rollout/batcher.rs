@@ -1,7 +1,7 @@
 //! Decisions in batches: whatever episodes are ready share one pass of the policy.
 //!
 //! No episode waits for a server of another one. While a batch is decided, the episodes of the one before it are stepped
-//! and come back; a batch waits for them, but never for long.
+//! and come back; a batch waits for its share of them, but never for long.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -9,12 +9,14 @@ use std::time::Duration;
 
 use decision::{Decider, Decision, DecisionFault, DecisionRequest, EpisodeContext, Observation};
 use tokio::runtime::Handle;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
 
 /// How long a batch waits for the running episodes that it lacks: a pass over many costs little more than one over few, so
 /// that waiting for a step is worth it, and waiting for a slow server is not.
 const BATCH_WAIT: Duration = Duration::from_millis(15);
+/// Batches that are decided side by side have at least so many episodes each: smaller ones share too little.
+const EPISODES_MIN: usize = 3;
 /// Episodes that may wait to be read; every one of them is held by a worker of its own.
 const WAITING_MAX: usize = 4096;
 
@@ -67,39 +69,44 @@ async fn decide_batches(
     mut received: mpsc::Receiver<Waiting>,
     active: Arc<AtomicUsize>,
 ) {
-    while let Some(first) = received.recv().await {
-        let batch = gather(first, &mut received, &active).await;
+    let parallel = decider.policy().info().parallel_calls;
+    let calls = Arc::new(Semaphore::new(parallel));
+    loop {
+        // A batch grows while it waits for its turn.
+        let Ok(turn) = Arc::clone(&calls).acquire_owned().await else { return };
+        let Some(first) = received.recv().await else { return };
+        let batch = gather(first, &mut received, &active, parallel).await;
         let (decider, runtime) = (Arc::clone(&decider), Handle::current());
         // A policy computes on all cores for tens of milliseconds: not on a thread that others need for their steps.
-        let decided =
-            tokio::task::spawn_blocking(move || runtime.block_on(decide(&decider, batch))).await;
-        if let Err(error) = decided {
-            // The episodes of the batch learn that their answer will not come.
-            tracing::error!("a decision panicked: {error}");
-        }
+        // A panic is reported by its hook, and the episodes of the batch learn that their answer will not come.
+        tokio::task::spawn_blocking(move || {
+            runtime.block_on(decide(&decider, batch));
+            drop(turn);
+        });
     }
 }
 
-/// All episodes that are ready, and those that become ready soon.
+/// Episodes that are ready, and those that become ready soon: a share of all that are running.
 async fn gather(
     first: Waiting,
     received: &mut mpsc::Receiver<Waiting>,
     active: &AtomicUsize,
+    parallel: usize,
 ) -> Vec<Waiting> {
     let deadline = Instant::now() + BATCH_WAIT;
     let mut batch = vec![first];
-    loop {
-        while let Ok(next) = received.try_recv() {
-            batch.push(next);
-        }
-        if batch.len() >= active.load(Ordering::Acquire) {
-            return batch;
-        }
+    while batch.len() < share(active.load(Ordering::Acquire), parallel) {
         match timeout_at(deadline, received.recv()).await {
             Ok(Some(next)) => batch.push(next),
-            Ok(None) | Err(_) => return batch,
+            Ok(None) | Err(_) => break,
         }
     }
+    batch
+}
+
+/// Episodes of one batch when so many are running.
+fn share(active: usize, parallel: usize) -> usize {
+    active.div_ceil((active / EPISODES_MIN).clamp(1, parallel))
 }
 
 async fn decide(decider: &Decider, mut batch: Vec<Waiting>) {

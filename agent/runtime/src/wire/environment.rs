@@ -18,6 +18,8 @@ use crate::session;
 /// Replies that may wait to be read: one that is awaited and late copies of it. More are dropped, for
 /// the server sends again what is asked again.
 const REPLIES_MAX: usize = 16;
+/// The first reset and the first step: simulators compile what these need, and do not move meanwhile.
+const FIRST_REQUESTS: u64 = 2;
 
 /// A session between episodes. Dropping it ends the session on the server.
 #[derive(Debug)]
@@ -223,6 +225,12 @@ impl Environment {
         }
     }
 
+    /// How long the server's heartbeat may be silent now.
+    fn silence_max(&self) -> Duration {
+        let Timing { silence_max, open_max, .. } = self.timing;
+        if self.sequence <= FIRST_REQUESTS { silence_max.max(open_max) } else { silence_max }
+    }
+
     async fn check_server(
         &mut self,
         asked: &'static str,
@@ -235,7 +243,7 @@ impl Environment {
         let waited = asked_at.elapsed();
         // Heartbeats start with the server; the first may arrive after our first request.
         let silent = status.beaten_at.map_or(waited, |beaten_at| beaten_at.elapsed().min(waited));
-        if silent > self.timing.silence_max || waited > self.timing.reply_max {
+        if silent > self.silence_max() || waited > self.timing.reply_max {
             let waited_secs = waited.as_secs();
             return Err(EnvironmentFault::TimedOut {
                 server: self.server.clone(),

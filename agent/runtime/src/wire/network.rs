@@ -49,7 +49,8 @@ pub struct Timing {
     pub silence_max: Duration,
     /// No reply takes longer than this, whatever the heartbeat says.
     pub reply_max: Duration,
-    /// A session is opened within this time; the server may have to load a model first.
+    /// A session is opened within this time, and its first reset and step answered without a heartbeat in between: the
+    /// server may have to load or to compile something first.
     pub open_max: Duration,
     /// A link that comes back within this time costs no episode: servers keep a session for as long.
     pub link_max: Duration,

@@ -1,9 +1,10 @@
 //! Worker pools of one thread, each with requests of its own, instead of all threads on each product.
 //!
 //! A step of the decode loop is dozens of small products. Divided among threads, each of them ends with the threads
-//! waiting for each other; divided by session, they wait once per decision. The bits are the same: a row's result does
-//! not depend on the rows beside it.
+//! waiting for each other; divided by session, they wait once per decision, and divided by call, never. The bits are the
+//! same: a row's result does not depend on the rows beside it.
 
+use std::sync::{Mutex, PoisonError};
 use std::thread;
 
 use anyhow::{Context as _, Result, anyhow};
@@ -14,11 +15,21 @@ use crate::kernels::backend::Backend;
 use crate::network::forward::Network;
 
 /// Minimum batch of a pool: below it, re-reading the weights dominates.
-const POOL_CANDIDATES_MIN: usize = 16;
+const POOL_CANDIDATES_MIN: usize = 8;
 
 /// One pool of a single thread per processor.
 pub struct WorkerPools {
     pools: Vec<ThreadPool>,
+    /// Calls that use each pool now.
+    calls: Mutex<Vec<usize>>,
+}
+
+/// The pools of one call, until it is dropped.
+struct Reserved<'a> {
+    pools: Vec<usize>,
+    /// All threads work on each product, and none in its pool.
+    is_undivided: bool,
+    of: &'a WorkerPools,
 }
 
 impl WorkerPools {
@@ -30,10 +41,17 @@ impl WorkerPools {
         };
         let one = |_| ThreadPoolBuilder::new().num_threads(1).build();
         let pools = (0..count).map(one).collect::<Result<_, _>>();
-        Ok(WorkerPools { pools: pools.context("cannot start the policy's threads")? })
+        let pools = pools.context("cannot start the policy's threads")?;
+        Ok(WorkerPools { pools, calls: Mutex::new(vec![0; count]) })
     }
 
-    /// All completions, session by session and candidate by candidate.
+    /// Pools that there are.
+    pub fn count(&self) -> usize {
+        self.pools.len()
+    }
+
+    /// All completions, session by session and candidate by candidate. A call that finds others computing takes the pool
+    /// that is used least; alone it takes as many as its batch pays for.
     pub fn complete(
         &self,
         network: &Network,
@@ -41,29 +59,51 @@ impl WorkerPools {
         limits: &Limits<'_>,
     ) -> Result<Vec<Completion>> {
         let candidates: usize = sessions.iter().map(|session| session.candidates).sum();
-        let pools = (candidates / POOL_CANDIDATES_MIN)
-            .min(sessions.len())
-            .min(self.pools.len())
-            .min(rayon::current_num_threads());
-        if pools < 2 {
+        let wanted = (candidates / POOL_CANDIDATES_MIN).min(sessions.len());
+        let reserved = self.reserve(wanted.min(rayon::current_num_threads()));
+        if reserved.is_undivided {
             // From outside of its pool, each of a step's dozens of products would wake a thread and wait for it.
             return rayon::scope(|_| complete(network, sessions, limits));
         }
-        let run = |pool: usize| -> Result<Vec<Completion>> {
-            let start = pool * sessions.len() / pools;
-            let own = &sessions[start..(pool + 1) * sessions.len() / pools];
-            let mut completions = self.pools[pool].install(|| complete(network, own, limits))?;
+        let count = reserved.pools.len();
+        let run = |part: usize| -> Result<Vec<Completion>> {
+            let start = part * sessions.len() / count;
+            let own = &sessions[start..(part + 1) * sessions.len() / count];
+            let pool = &self.pools[reserved.pools[part]];
+            let mut completions = pool.install(|| complete(network, own, limits))?;
             completions.iter_mut().for_each(|completion| completion.session += start);
             Ok(completions)
         };
         let run = &run;
         let parts = thread::scope(|scope| {
-            let threads: Vec<_> = (0..pools).map(|pool| scope.spawn(move || run(pool))).collect();
+            let threads: Vec<_> = (0..count).map(|part| scope.spawn(move || run(part))).collect();
             let join = |thread: thread::ScopedJoinHandle<'_, _>| {
                 thread.join().unwrap_or_else(|_| Err(anyhow!("a worker of the policy panicked")))
             };
             threads.into_iter().map(join).collect::<Result<Vec<_>>>()
         })?;
         Ok(parts.into_iter().flatten().collect())
+    }
+
+    fn reserve(&self, wanted: usize) -> Reserved<'_> {
+        let mut calls = self.calls.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_alone = calls.iter().all(|&calls| calls == 0);
+        let is_undivided = is_alone && wanted < 2;
+        let mut pools: Vec<usize> = (0..calls.len()).collect();
+        pools.sort_by_key(|&pool| calls[pool]);
+        match (is_undivided, is_alone) {
+            (true, _) => {}
+            (false, true) => pools.truncate(wanted),
+            (false, false) => pools.truncate(1),
+        }
+        pools.iter().for_each(|&pool| calls[pool] += 1);
+        Reserved { pools, is_undivided, of: self }
+    }
+}
+
+impl Drop for Reserved<'_> {
+    fn drop(&mut self) {
+        let mut calls = self.of.calls.lock().unwrap_or_else(PoisonError::into_inner);
+        self.pools.iter().for_each(|&pool| calls[pool] -= 1);
     }
 }
