@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use decision::scripted::ScriptedPolicy;
 use decision::{Decider, Setting, Strategy, TaskId};
-use protocol::PROTOCOL_VERSION;
+use protocol::{Open, PROTOCOL_VERSION};
 use runtime::experiment::pool_options;
 use runtime::fault::EnvironmentFault;
 use runtime::rollout::{RecordOptions, Rollout};
 use runtime::sinks::{Event, EventSink, Sinks};
 use runtime::stop::Stop;
-use runtime::wire::{Environment, Network, NetworkOptions, Timing, ZenohPool};
+use runtime::wire::{Environment, Network, NetworkOptions, PoolOptions, Timing, ZenohPool};
 use store::plan::EpisodePlan;
 use store::queue::RunQueue;
 use store::record::Versions;
@@ -25,6 +25,8 @@ use crate::server::{Server, free_endpoint, open_router};
 const EPISODES: u32 = 6;
 /// Longest wait for a run that takes seconds on a machine with nothing else to do.
 const WAIT: Duration = Duration::from_secs(120);
+/// A run without a session gives up after this long, unless the test says otherwise.
+const FIRST_SESSION_WAIT: Duration = Duration::from_secs(60);
 
 /// Keeps the servers of recorded episodes and the reasons of faults.
 #[derive(Clone, Default)]
@@ -48,18 +50,24 @@ async fn run_beside(fleet: &str, defect: &str, timing: Timing) -> (Vec<String>, 
     let router = open_router(&endpoint).await;
     let _broken = Server::start_broken_behind_router(&endpoint, fleet, defect);
     let _healthy = Server::start_behind_router(&endpoint, fleet, &[]);
-    let options = NetworkOptions {
-        connect: vec![endpoint],
-        listen_here: false,
-        fleet: fleet.to_owned(),
-        timing,
-        ..NetworkOptions::default()
-    };
-    let network = Network::open(options).await.expect("the network opens");
-    let seen = network.fleet();
-    let mut both = seen.clone();
+    let network = connected(endpoint, fleet, timing).await;
+    let mut both = network.fleet();
     let both = both.wait_for(|fleet| fleet.servers.len() + fleet.undescribed.len() == 2);
     tokio::time::timeout(WAIT, both).await.expect("both are seen").expect("the network is open");
+    let kept = Kept::default();
+    let rollout = rollout(&network, FIRST_SESSION_WAIT, &kept);
+    let begun = Instant::now();
+    tokio::time::timeout(WAIT, rollout.run()).await.expect("in time").expect("the run goes on");
+    let took = begun.elapsed();
+    network.close().await.expect("the network closes");
+    router.close().await.expect("the router closes");
+    let kept = kept.0.lock().expect("unpoisoned");
+    assert_eq!(kept.0.len(), EPISODES as usize, "every episode is recorded: {:?}", kept.1);
+    (kept.1.clone(), took)
+}
+
+/// Episodes of a scripted policy, three at once.
+fn rollout(network: &Network, wait: Duration, kept: &Kept) -> Rollout<ZenohPool> {
     let plan = |episode| EpisodePlan {
         task: TaskId::default_of("widowx_spoon_on_towel"),
         layout: None,
@@ -72,10 +80,11 @@ async fn run_beside(fleet: &str, defect: &str, timing: Timing) -> (Vec<String>, 
     let queue = RunQueue::new("run", &plans, &[setting], &BTreeSet::new());
     let decider = Arc::new(Decider::new(Arc::new(ScriptedPolicy::new())));
     let pool = pool_options(decider.policy().info(), "test".to_owned(), None);
-    let (_stop, stop) = watch::channel(Stop::No);
-    let (_scorer, scorer) = watch::channel(None);
-    let kept = Kept::default();
-    let rollout = Rollout {
+    let pool = PoolOptions { wait, first_wait: wait, ..pool };
+    // Their senders are gone, and with them every change.
+    let (_, stop) = watch::channel(Stop::No);
+    let (_, scorer) = watch::channel(None);
+    Rollout {
         decider,
         scorer,
         pool: ZenohPool::new(network.clone(), None, pool),
@@ -85,15 +94,30 @@ async fn run_beside(fleet: &str, defect: &str, timing: Timing) -> (Vec<String>, 
         options: RecordOptions::default(),
         versions: versions(),
         stop,
+    }
+}
+
+async fn connected(endpoint: String, fleet: &str, timing: Timing) -> Network {
+    let options = NetworkOptions {
+        connect: vec![endpoint],
+        listen_here: false,
+        fleet: fleet.to_owned(),
+        timing,
+        ..NetworkOptions::default()
     };
-    let begun = Instant::now();
-    tokio::time::timeout(WAIT, rollout.run()).await.expect("in time").expect("the run goes on");
-    let took = begun.elapsed();
-    network.close().await.expect("the network closes");
-    router.close().await.expect("the router closes");
-    let kept = kept.0.lock().expect("unpoisoned");
-    assert_eq!(kept.0.len(), EPISODES as usize, "every episode is recorded: {:?}", kept.1);
-    (kept.1.clone(), took)
+    Network::open(options).await.expect("the network opens")
+}
+
+fn open() -> Open {
+    Open {
+        protocol: PROTOCOL_VERSION,
+        task: "widowx_spoon_on_towel".to_owned(),
+        variant: "default".to_owned(),
+        image_height: 0,
+        image_width: 0,
+        expert: false,
+        holder: "test".to_owned(),
+    }
 }
 
 fn versions() -> Versions {
@@ -109,9 +133,29 @@ fn versions() -> Versions {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_server_that_never_answers_open_holds_up_no_episode_of_others() {
-    let timing = Timing { open_max: Duration::from_secs(4), ..Timing::default() };
-    let (faults, _) = run_beside("never-opens", "never_opens", timing).await;
+    let timing = Timing { open_max: WAIT, ..Timing::default() };
+    let (faults, took) = run_beside("never-opens", "never_opens", timing).await;
+    assert!(took < WAIT / 2, "the healthy server's episodes took {took:?}");
     assert!(faults.is_empty(), "no episode had begun there: {faults:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_that_finds_every_session_in_use_ends_in_time_and_says_so() {
+    let endpoint = free_endpoint();
+    let router = open_router(&endpoint).await;
+    let server = Server::start_behind_router(&endpoint, "full", &["--sessions=1"]);
+    let network = connected(endpoint, "full", Timing::default()).await;
+    assert_eq!(network.servers(1, WAIT).await.servers.len(), 1, "the server is found");
+    let held = Environment::open(&network, &server.id, open()).await.expect("the only session");
+    let kept = Kept::default();
+    let rollout = rollout(&network, Duration::from_secs(4), &kept);
+    let ended = tokio::time::timeout(WAIT / 2, rollout.run()).await.expect("in time");
+    let error = ended.expect_err("there is no session").to_string();
+    assert!(error.contains("could be opened within 4 s"), "{error}");
+    assert!(error.contains("all 1 sessions are in use, by test"), "{error}");
+    drop(held);
+    network.close().await.expect("the network closes");
+    router.close().await.expect("the router closes");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -160,23 +204,9 @@ async fn a_reply_that_precedes_its_request_is_refused() {
     let endpoint = free_endpoint();
     let router = open_router(&endpoint).await;
     let server = Server::start_broken_behind_router(&endpoint, "ahead", "answers_ahead");
-    let options = NetworkOptions {
-        connect: vec![endpoint],
-        listen_here: false,
-        fleet: "ahead".to_owned(),
-        ..NetworkOptions::default()
-    };
-    let network = Network::open(options).await.expect("the network opens");
+    let network = connected(endpoint, "ahead", Timing::default()).await;
     assert_eq!(network.servers(1, WAIT).await.servers.len(), 1);
-    let open = protocol::Open {
-        protocol: PROTOCOL_VERSION,
-        task: "widowx_spoon_on_towel".to_owned(),
-        variant: "default".to_owned(),
-        image_height: 0,
-        image_width: 0,
-        expert: false,
-        holder: "test".to_owned(),
-    };
+    let open = open();
     let reset = protocol::Reset {
         task: open.task.clone(),
         variant: open.variant.clone(),

@@ -223,7 +223,10 @@ async fn a_session_dies_with_its_holder() {
     let environment = Environment::open(&holder, &server.id, open()).await.expect("a session");
     let fault =
         Environment::open(&network, &server.id, open()).await.expect_err("one session at once");
-    assert_eq!(fault, EnvironmentFault::Refused { reason: "all 1 sessions are in use".into() });
+    assert_eq!(
+        fault,
+        EnvironmentFault::Refused { reason: "all 1 sessions are in use, by test".into() }
+    );
     let mut episode = environment.reset(spoon()).await.expect("an episode");
     episode.step(&[0.0; 7]).await.expect("a step");
     drop(episode);

@@ -48,6 +48,7 @@ def health(arguments: argparse.Namespace) -> int:
 
     from rever_env import protocol
     from rever_env.serving import Endpoints, cause
+    from rever_env.tasks import TaskId
 
     seconds = arguments.timeout_secs
     endpoints = Endpoints((arguments.connect,), (), multicast=False, wait_secs=seconds)
@@ -70,8 +71,10 @@ def health(arguments: argparse.Namespace) -> int:
                 except protocol.CodecError as error:
                     misread = f"; the description of one cannot be read: {error}"
                     continue
+                tasks = ", ".join(str(TaskId(task.task, task.variant)) for task in server.tasks)
                 print(
-                    f"{server.server}: {server.sessions} of {server.sessions_max} sessions in use"
+                    f"{server.server}: {server.sessions} of {server.sessions_max} sessions in "
+                    f"use; tasks: {tasks}"
                 )
                 found += 1
     return 0 if found else _unanswered(arguments, misread)

@@ -104,7 +104,10 @@ class RobosuiteWorld:
         """
         steps = self._running()
         if steps >= self.task.steps_max:
-            raise InvalidAction(f"step {steps + 1}: expected at most {self.task.steps_max}")
+            raise InvalidAction(
+                f"step {steps + 1}: expected at most {self.task.steps_max}; "
+                "reset begins a new episode"
+            )
         count = len(self.task.action)
         if action.shape != (count,):
             raise InvalidAction(f"action: expected shape ({count},), got {action.shape}")

@@ -51,6 +51,7 @@ class _Lease:
     """A session with what zenoh holds for it. zenoh's threads write holder."""
 
     name: str
+    opened_for: str
     session: Session
     outbox: Outbox
     opened_at: float
@@ -179,7 +180,10 @@ class Server:
         try:
             opened = protocol.OPEN.decode(query.payload.to_bytes() if size(query) else b"")
             if self._sessions() >= self._options.sessions_max:
-                raise ValueError(f"all {self._options.sessions_max} sessions are in use")
+                raise ValueError(
+                    f"all {self._options.sessions_max} sessions are in use, by "
+                    + ", ".join(sorted({lease.opened_for for lease in self._leases.values()}))
+                )
             answer = protocol.Opened(self._lease(opened))
         except (ValueError, UnknownTask, Fault) as error:
             answer = protocol.OpenRefused(str(error)[:200])
@@ -195,7 +199,7 @@ class Server:
             reliability=zenoh.Reliability.RELIABLE,
             express=True,
         )
-        lease = _Lease(name, session, Outbox(publisher), time.monotonic(), [])
+        lease = _Lease(name, opened.holder, session, Outbox(publisher), time.monotonic(), [])
         self._leases[name] = lease
 
         lease.declared = [

@@ -121,7 +121,10 @@ class World:
         """One control step of 0.2 s. action: float64 (7,), see the controller; gripper +1 open."""
         memory = self._running()
         if self.steps >= self.task.steps_max:
-            raise InvalidAction(f"step {self.steps + 1}: expected at most {self.task.steps_max}")
+            raise InvalidAction(
+                f"step {self.steps + 1}: expected at most {self.task.steps_max}; "
+                "reset begins a new episode"
+            )
         action = _checked(action)
         target = self.controller.joint_target(self.data, action)
         self._advance(target, float(action[6]))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from conftest import free_endpoint
+from rever_env.tasks import TaskId, load
 
 
 @pytest.fixture
@@ -45,7 +46,8 @@ def test_only_a_server_that_works_is_healthy(
     name = server.stdout.readline().split()[1]
     working = health(endpoint, "60")
     assert (working.returncode, working.stderr) == (0, "")
-    assert working.stdout == f"{name}: 0 of 16 sessions in use\n"
+    tasks = ", ".join(str(TaskId(task.name, task.variant)) for task in load().values())
+    assert working.stdout == f"{name}: 0 of 16 sessions in use; tasks: {tasks}\n"
 
     assert health(endpoint, "60", "--id-file", str(tmp_path / "id")).stdout == working.stdout
     (tmp_path / "other").write_text("another")

@@ -14,6 +14,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use command::Program;
+use runtime::experiment::UnknownTask;
 use runtime::servers::Host;
 
 fn main() -> ExitCode {
@@ -27,7 +28,8 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            ExitCode::from(if error.is::<command::WrongUsage>() { 2 } else { 1 })
+            let is_usage = error.is::<command::WrongUsage>() || error.is::<UnknownTask>();
+            ExitCode::from(if is_usage { 2 } else { 1 })
         }
     }
 }

@@ -4,20 +4,18 @@
 //! uninterrupted run have the same episodes. The policy's seed does not depend on the strategy: all settings of one episode
 //! start from the same initial layout with the same random numbers, which is what makes their differences paired.
 
+use anyhow::Context;
 use clap::ValueEnum;
 use decision::TaskId;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-use store::plan::{EpisodePlan, SEEDS_PER_RANGE, SeedRange};
-
-/// Fixed initial layouts of each of SIMPLER's tasks.
-pub const LAYOUTS: u32 = 24;
+use store::plan::{EpisodePlan, OfferedTask, SEEDS_PER_RANGE, SeedRange};
 
 /// Where the objects of each episode start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Layouts {
-    /// The 24 fixed layouts, over and over.
+    /// The task's fixed layouts, over and over.
     Grid,
     /// Drawn from each episode's seed.
     Random,
@@ -27,7 +25,7 @@ pub enum Layouts {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Suite {
     /// Tasks, each in a variant.
-    pub tasks: Vec<TaskId>,
+    pub tasks: Vec<OfferedTask>,
     /// Episodes of each task.
     pub episodes: u32,
     /// Where objects start.
@@ -39,24 +37,34 @@ pub struct Suite {
 }
 
 impl Suite {
-    /// The episodes, task by task within each number, so that a partial run covers all tasks alike.
-    pub fn episodes(&self) -> Vec<EpisodePlan> {
+    /// The episodes, task by task within each number, so that a partial run covers all tasks alike. An error when a task
+    /// has no fixed layouts and is to be run on them.
+    pub fn episodes(&self) -> anyhow::Result<Vec<EpisodePlan>> {
         let numbers = 0..self.episodes;
         numbers
             .flat_map(|episode| self.tasks.iter().map(move |task| self.episode(task, episode)))
             .collect()
     }
 
-    fn episode(&self, task: &TaskId, episode: u32) -> EpisodePlan {
+    fn episode(&self, task: &OfferedTask, episode: u32) -> anyhow::Result<EpisodePlan> {
+        let OfferedTask { id: task, layouts } = task;
+        let layout = match self.layouts {
+            Layouts::Random => None,
+            Layouts::Grid => Some(episode.checked_rem(*layouts).with_context(|| {
+                format!(
+                    "layouts: expected random ones for {task}, which has no fixed ones, got grid"
+                )
+            })?),
+        };
         let place = mixed("place", task, episode, self.seed);
-        EpisodePlan {
+        Ok(EpisodePlan {
             task: task.clone(),
-            layout: (self.layouts == Layouts::Grid).then_some(episode % LAYOUTS),
+            layout,
             episode,
             seed: self.range.first() + place % SEEDS_PER_RANGE,
             // Every reader of a record, JavaScript included, must hold this number exactly.
             sampling_seed: mixed("sample", task, episode, self.seed) % (1 << 53),
-        }
+        })
     }
 }
 
@@ -81,37 +89,42 @@ mod tests {
     ];
 
     fn suite(layouts: Layouts, seed: u64) -> Suite {
-        let tasks = TASKS.map(TaskId::default_of).to_vec();
+        let tasks =
+            TASKS.map(|task| OfferedTask { id: TaskId::default_of(task), layouts: 24 }).to_vec();
         Suite { tasks, episodes: 30, layouts, range: SeedRange::Evaluation, seed }
+    }
+
+    fn plans(suite: &Suite) -> Vec<EpisodePlan> {
+        suite.episodes().expect("fixed layouts")
     }
 
     #[test]
     fn an_episode_is_the_same_in_every_suite_that_has_it() {
-        let all = suite(Layouts::Random, 5).episodes();
+        let all = plans(&suite(Layouts::Random, 5));
         let mut few = suite(Layouts::Random, 5);
-        few.tasks = vec![TaskId::default_of(TASKS[2])];
+        few.tasks = vec![few.tasks.remove(2)];
         few.episodes = 7;
-        for plan in few.episodes() {
+        for plan in plans(&few) {
             assert!(all.contains(&plan), "{plan:?}");
         }
     }
 
     #[test]
     fn seeds_differ_and_stay_in_their_range() {
-        let mut plans = suite(Layouts::Random, 0).episodes();
-        plans.extend(suite(Layouts::Random, 1).episodes());
-        assert!(plans.iter().all(|plan| SeedRange::Evaluation.contains(plan.seed)));
-        assert!(plans.iter().all(|plan| !SeedRange::Collection.contains(plan.seed)));
-        assert!(plans.iter().all(|plan| plan.sampling_seed < 1 << 53));
+        let mut all = plans(&suite(Layouts::Random, 0));
+        all.extend(plans(&suite(Layouts::Random, 1)));
+        assert!(all.iter().all(|plan| SeedRange::Evaluation.contains(plan.seed)));
+        assert!(all.iter().all(|plan| !SeedRange::Collection.contains(plan.seed)));
+        assert!(all.iter().all(|plan| plan.sampling_seed < 1 << 53));
         for seeds in [|plan: &EpisodePlan| plan.seed, |plan: &EpisodePlan| plan.sampling_seed] {
-            let different: std::collections::BTreeSet<u64> = plans.iter().map(seeds).collect();
-            assert_eq!(different.len(), plans.len());
+            let different: std::collections::BTreeSet<u64> = all.iter().map(seeds).collect();
+            assert_eq!(different.len(), all.len());
         }
     }
 
     #[test]
     fn seeds_never_change_between_versions() {
-        let plan = &suite(Layouts::Random, 0).episodes()[0];
+        let plan = &plans(&suite(Layouts::Random, 0))[0];
         assert_eq!((plan.seed, plan.sampling_seed), SEEDS_OF_THE_FIRST_EPISODE);
     }
 
@@ -120,11 +133,26 @@ mod tests {
     const SEEDS_OF_THE_FIRST_EPISODE: (u64, u64) = (3_977_631_995, 8_353_930_603_780_422);
 
     #[test]
-    fn the_grid_has_every_layout_once_before_any_comes_again() {
-        let plans = suite(Layouts::Grid, 0).episodes();
-        let of_task = plans.iter().filter(|plan| plan.task.task == TASKS[1]);
-        let layouts: Vec<Option<u32>> = of_task.map(|plan| plan.layout).collect();
-        assert_eq!(layouts[..24], (0..24).map(Some).collect::<Vec<_>>());
-        assert_eq!(layouts[24..], (0..6).map(Some).collect::<Vec<_>>());
+    fn the_grid_has_every_layout_of_a_task_once_before_any_comes_again() {
+        let mut suite = suite(Layouts::Grid, 0);
+        suite.tasks[1].layouts = 7;
+        let layouts = |task: usize| -> Vec<Option<u32>> {
+            let of_task = plans(&suite).into_iter().filter(|plan| plan.task.task == TASKS[task]);
+            of_task.map(|plan| plan.layout).collect()
+        };
+        let expected =
+            |count: u32| (0..30).map(|episode| Some(episode % count)).collect::<Vec<_>>();
+        assert_eq!((layouts(0), layouts(1)), (expected(24), expected(7)));
+    }
+
+    #[test]
+    fn a_task_without_fixed_layouts_has_no_grid() {
+        let mut suite = suite(Layouts::Grid, 0);
+        suite.tasks[2].layouts = 0;
+        let error = suite.episodes().expect_err("no grid").to_string();
+        let expected = "layouts: expected random ones for widowx_stack_cube, which has no fixed ones, got grid";
+        assert_eq!(error, expected);
+        suite.layouts = Layouts::Random;
+        assert_eq!(plans(&suite).len(), 120);
     }
 }

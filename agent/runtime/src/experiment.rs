@@ -8,10 +8,11 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail, ensure};
 use decision::{Decider, Policy, PolicyInfo, Scorer, Setting, TaskId, VARIANT_DEFAULT};
 use protocol::VerifierUpdate;
-use store::plan::EpisodePlan;
+use store::plan::{EpisodePlan, OfferedTask};
 use store::queue::{EpisodeQueue, GivenUp, RunQueue};
 use store::record::Versions;
 use store::run::{self, Run};
+use thiserror::Error;
 use tokio::runtime::Runtime;
 use tokio::sync::watch;
 
@@ -75,8 +76,9 @@ impl Ending {
             return Ok(());
         }
         let why = if self.was_stopped { "stopped" } else { "faults" };
+        let given_up: String = self.given_up.iter().map(|one| format!("\n{one}")).collect();
         bail!(
-            "{why}: {} of {} episodes incomplete; rerun the same command to resume {}",
+            "{why}: {} of {} episodes incomplete; rerun the same command to resume {}{given_up}",
             self.missing,
             self.planned,
             folder.display()
@@ -133,7 +135,8 @@ impl Experiment {
         queue: Arc<RunQueue>,
     ) -> Result<bool> {
         let network = &deployment.network;
-        self.check_tasks(deployment).await?;
+        let wanted: BTreeSet<TaskId> = self.plans.iter().map(|plan| plan.task.clone()).collect();
+        offered_tasks(deployment, &wanted.into_iter().collect::<Vec<_>>()).await?;
         let name = run.header.run.clone();
         let (scorer, _following) = self.scorers(deployment).await?;
         let summaries = run.summaries()?;
@@ -165,21 +168,6 @@ impl Experiment {
         };
         rollout.run().await?;
         Ok(*stop.borrow() != Stop::No)
-    }
-
-    /// A task that nobody offers would break every one of its episodes.
-    async fn check_tasks(&self, deployment: &Deployment) -> Result<()> {
-        let wanted: BTreeSet<&TaskId> = self.plans.iter().map(|plan| &plan.task).collect();
-        let mut fleet = deployment.first_servers().await?;
-        if !wanted.is_subset(&offered(&fleet).iter().collect()) {
-            fleet = deployment.network.servers(fleet.servers.len() + 1, OTHERS_WAIT).await;
-        }
-        let offered = offered(&fleet);
-        if let Some(task) = wanted.into_iter().find(|task| !offered.contains(*task)) {
-            let offered: Vec<String> = offered.iter().map(TaskId::to_string).collect();
-            bail!("task: expected one of {}, got {task}", offered.join(", "));
-        }
-        Ok(())
     }
 
     /// The scorer of now and those that are published later, and what must live for that.
@@ -246,28 +234,85 @@ pub fn pool_options(policy: &PolicyInfo, holder: String, simulator: Option<Strin
     }
 }
 
-/// The tasks that servers offer in their default variant, in the order of their descriptions.
-pub async fn default_tasks(deployment: &Deployment) -> Result<Vec<TaskId>> {
-    let fleet = deployment.first_servers().await?;
-    let mut tasks: Vec<TaskId> = Vec::new();
-    for offer in fleet.servers.values().flat_map(|server| &server.tasks) {
-        let task = TaskId::new(&offer.task, &offer.variant);
-        if task.variant == VARIANT_DEFAULT && !tasks.contains(&task) {
-            tasks.push(task);
-        }
+/// The wanted tasks as servers offer them. One that nobody offers is an error, for every one of its episodes would break.
+pub async fn offered_tasks(deployment: &Deployment, wanted: &[TaskId]) -> Result<Vec<OfferedTask>> {
+    let mut fleet = deployment.first_servers().await?;
+    let offers = |offered: &[OfferedTask]| -> Result<Vec<OfferedTask>, TaskId> {
+        let find = |id: &TaskId| offered.iter().find(|task| task.id == *id).cloned();
+        wanted.iter().map(|id| find(id).ok_or_else(|| id.clone())).collect()
+    };
+    if offers(&tasks_of(&fleet)).is_err() {
+        fleet = deployment.network.servers(fleet.servers.len() + 1, OTHERS_WAIT).await;
     }
+    let offered = tasks_of(&fleet);
+    offers(&offered).map_err(|task| {
+        let offered = offered.iter().map(|task| task.id.to_string()).collect();
+        anyhow::Error::new(UnknownTask { task, offered })
+    })
+}
+
+/// A task that no server offers.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("task: expected one of {}, got {task}", offered.join(", "))]
+pub struct UnknownTask {
+    /// The task.
+    pub task: TaskId,
+    /// What is offered.
+    pub offered: Vec<String>,
+}
+
+/// The tasks that servers offer in their default variant.
+pub async fn default_tasks(deployment: &Deployment) -> Result<Vec<OfferedTask>> {
+    let mut tasks = tasks_of(&deployment.first_servers().await?);
+    tasks.retain(|task| task.id.variant == VARIANT_DEFAULT);
     ensure!(!tasks.is_empty(), "tasks: expected --tasks, for no server offers a default variant");
     Ok(tasks)
 }
 
-/// Every task in every variant that some server offers.
-fn offered(fleet: &Fleet) -> BTreeSet<TaskId> {
-    let tasks = fleet.servers.values().flat_map(|server| &server.tasks);
-    tasks.map(|offer| TaskId::new(&offer.task, &offer.variant)).collect()
+/// Each task in each variant once, in the order of the descriptions.
+fn tasks_of(fleet: &Fleet) -> Vec<OfferedTask> {
+    let mut tasks: Vec<OfferedTask> = Vec::new();
+    for offer in fleet.servers.values().flat_map(|server| &server.tasks) {
+        let id = TaskId::new(&offer.task, &offer.variant);
+        if tasks.iter().all(|task| task.id != id) {
+            tasks.push(OfferedTask { id, layouts: offer.layouts });
+        }
+    }
+    tasks
 }
 
 impl std::fmt::Debug for Experiment {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.debug_struct("Experiment").field("title", &self.title).finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use store::record::EpisodeIdentity;
+
+    use super::*;
+
+    #[test]
+    fn a_partial_result_names_the_episodes_that_were_given_up() {
+        let identity = EpisodeIdentity {
+            run: "run".to_owned(),
+            task: "stack".to_owned(),
+            variant: "default".to_owned(),
+            layout: None,
+            episode: 3,
+            seed: 1,
+            sampling_seed: 1,
+            strategy: "sample".to_owned(),
+            candidates: 1,
+            temperature: 1.0,
+        };
+        let given_up = vec![GivenUp { identity, reasons: vec!["a".into(), "diverged".into()] }];
+        let ending = Ending { missing: 1, planned: 4, given_up, was_stopped: false };
+        let error = ending.ensure_complete(Path::new("run")).expect_err("it is partial");
+        let error = error.to_string();
+        assert!(error.starts_with("faults: 1 of 4 episodes incomplete"), "{error}");
+        assert!(error.contains("stack-default-0003"), "{error}");
+        assert!(error.ends_with("given up after 2 faults, the last one: diverged"), "{error}");
     }
 }

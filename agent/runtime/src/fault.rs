@@ -124,7 +124,7 @@ impl AttemptFault {
 }
 
 /// Text of a peer without control characters: it reaches terminals, logs and pages.
-fn printable(text: &str) -> String {
+pub(crate) fn printable(text: &str) -> String {
     text.chars().map(|letter| if letter.is_control() { '\u{fffd}' } else { letter }).collect()
 }
 

@@ -30,6 +30,15 @@ impl SeedRange {
     }
 }
 
+/// A task that servers offer, in one variant.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OfferedTask {
+    /// The task and its variant.
+    pub id: TaskId,
+    /// How many fixed initial layouts it has.
+    pub layouts: u32,
+}
+
 /// One episode to be run, not yet tied to a setting.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EpisodePlan {

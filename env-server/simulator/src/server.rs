@@ -3,7 +3,7 @@
 //! callback -> inbox -> simulation thread -> session -> outbox: neither zenoh's threads nor the simulation thread wait
 //! for a peer.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -55,6 +55,7 @@ pub struct Server<'a> {
 
 /// A session with what zenoh holds for it.
 struct Lease {
+    opened_for: String,
     session: Session,
     opened_at: Instant,
     closed_at: Option<Instant>,
@@ -204,7 +205,13 @@ impl<'a> Server<'a> {
         let bytes = query.payload().map(|payload| payload.to_bytes()).unwrap_or_default();
         let opened: Open = decode(&bytes)?;
         let sessions_max = self.options.sessions_max;
-        ensure!(self.sessions() < sessions_max, "all {sessions_max} sessions are in use");
+        let holders: BTreeSet<&str> =
+            self.leases.values().map(|lease| &*lease.opened_for).collect();
+        ensure!(
+            self.sessions() < sessions_max,
+            "all {sessions_max} sessions are in use, by {}",
+            Vec::from_iter(holders).join(", ")
+        );
         let holder = opened.holder.clone();
         let session = Session::new(opened, &mut self.worlds)?;
         let name = fresh_id();
@@ -228,6 +235,7 @@ impl<'a> Server<'a> {
         let seen = Arc::new(Mutex::new(Holder::Awaited));
         let token = self.watch(&name, Arc::clone(&seen))?;
         let lease = Lease {
+            opened_for: holder.clone(),
             session,
             opened_at: Instant::now(),
             closed_at: None,

@@ -95,7 +95,10 @@ impl World {
         let steps = self.running()?.steps;
         let steps_max = self.task.rule.steps_max;
         if steps >= steps_max {
-            return Err(Fault::Wrong(format!("step {}: expected at most {steps_max}", steps + 1)));
+            return Err(Fault::Wrong(format!(
+                "step {}: expected at most {steps_max}; reset begins a new episode",
+                steps + 1
+            )));
         }
         let action: [f32; ACTION_LENGTH] = action.try_into().map_err(|_| {
             let (expected, got) = (ACTION_LENGTH, action.len());

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use decision::{Decider, Policy, Scorer, Setting, Strategy, TaskId};
+use decision::{Decider, Policy, Scorer, Setting, Strategy};
 use evaluation::suite::{Layouts, Suite};
 use runtime::experiment::{default_tasks, pool_options};
 use runtime::rollout::{RecordOptions, Rollout};
@@ -15,7 +15,7 @@ use runtime::stop::Stop;
 use runtime::wire::{OutcomePublisher, ZenohPool};
 use serde::Serialize;
 use serde_json::json;
-use store::plan::SeedRange;
+use store::plan::{OfferedTask, SeedRange};
 use store::queue::{EpisodeQueue, RunQueue};
 use store::run::{Run, RunRequest};
 use tokio::sync::watch;
@@ -86,7 +86,7 @@ impl ThroughputBench<'_> {
     async fn count(
         &self,
         deployment: &Deployment,
-        tasks: &[TaskId],
+        tasks: &[OfferedTask],
         sessions: usize,
     ) -> Result<Row> {
         let folder = tempfile::tempdir().context("cannot make a folder")?;
@@ -99,7 +99,7 @@ impl ThroughputBench<'_> {
         })?;
         let name = run.header.run.clone();
         let warm_up = WARM_UP_STEPS * sessions as u64;
-        let queue = self.queue(&name, tasks, warm_up + self.decisions, sessions);
+        let queue = self.queue(&name, tasks, warm_up + self.decisions, sessions)?;
         let waiting = queue.progress().await?.waiting as u64;
         let progress = Progress::new(&title, waiting, 0, 0);
         let counts = progress.counts();
@@ -142,7 +142,13 @@ impl ThroughputBench<'_> {
     }
 
     /// Episodes enough that no session is idle before so many decisions are made.
-    fn queue(&self, run: &str, tasks: &[TaskId], decisions: u64, sessions: usize) -> RunQueue {
+    fn queue(
+        &self,
+        run: &str,
+        tasks: &[OfferedTask],
+        decisions: u64,
+        sessions: usize,
+    ) -> Result<RunQueue> {
         let episodes = (decisions / HORIZON_MIN) as usize + 2 * sessions;
         let suite = Suite {
             tasks: tasks.to_vec(),
@@ -152,7 +158,7 @@ impl ThroughputBench<'_> {
             seed: 0,
         };
         let setting = Setting::new(Strategy::Verifier, self.candidates, 1.0);
-        RunQueue::new(run, &suite.episodes(), &[setting], &BTreeSet::new())
+        Ok(RunQueue::new(run, &suite.episodes()?, &[setting], &BTreeSet::new()))
     }
 }
 

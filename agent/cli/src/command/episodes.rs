@@ -14,7 +14,7 @@ use runtime::servers::{Deployment, Host, LocalSource, ServerSource, Simulator};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 use store::labels::LabelStore;
-use store::plan::SeedRange;
+use store::plan::{OfferedTask, SeedRange};
 use store::run::{self, Run, RunRequest};
 use tokio::runtime::Runtime;
 use verifier::Verifier;
@@ -149,7 +149,7 @@ impl EpisodesArguments {
         let verifier = self.verifier(&folder, &digest)?;
         self.check(&request, verifier.as_deref())?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let (tasks, deployment) = self.tasks(&runtime, host)?;
+        let (tasks, deployment) = self.tasks(request.layouts, &runtime, host)?;
         let suite = Suite {
             tasks,
             episodes: request.episodes,
@@ -157,13 +157,14 @@ impl EpisodesArguments {
             range: request.range,
             seed: self.seed,
         };
+        let plans = suite.episodes().map_err(|error| WrongUsage(error.to_string()))?;
         let options = self.options(&suite, &request.settings);
         let versions = build_info::versions(&digest, verifier.as_deref().map(Verifier::digest));
         let run = self.open_run(request.title, options, versions)?;
         let run_folder = run.folder.clone();
         let experiment = Experiment {
             title: request.title.to_owned(),
-            plans: suite.episodes(),
+            plans,
             settings: request.settings,
             policy: Arc::new(policy),
             scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
@@ -201,13 +202,23 @@ impl EpisodesArguments {
         LabelStore::open(&self.labels).map(drop)
     }
 
-    /// The tasks that were asked for; where none were, those that the servers offer, which must run for that.
-    fn tasks(&self, runtime: &Runtime, host: &Host) -> Result<(Vec<TaskId>, Option<Deployment>)> {
-        if !self.tasks.is_empty() {
-            return Ok((self.tasks.clone(), None));
+    /// The tasks that were asked for, or all that servers offer. The servers must run for it where they alone can say which
+    /// tasks or layouts there are.
+    fn tasks(
+        &self,
+        layouts: Layouts,
+        runtime: &Runtime,
+        host: &Host,
+    ) -> Result<(Vec<OfferedTask>, Option<Deployment>)> {
+        if !self.tasks.is_empty() && layouts == Layouts::Random {
+            let unasked = |id: &TaskId| OfferedTask { id: id.clone(), layouts: 0 };
+            return Ok((self.tasks.iter().map(unasked).collect(), None));
         }
         let deployment = self.servers(host)?.open(runtime, usize::from(self.sessions))?;
-        let tasks = runtime.block_on(experiment::default_tasks(&deployment))?;
+        let tasks = match &self.tasks[..] {
+            [] => runtime.block_on(experiment::default_tasks(&deployment))?,
+            wanted => runtime.block_on(experiment::offered_tasks(&deployment, wanted))?,
+        };
         Ok((tasks, Some(deployment)))
     }
 
@@ -215,7 +226,7 @@ impl EpisodesArguments {
     fn options(&self, suite: &Suite, settings: &[Setting]) -> Value {
         let Suite { tasks, episodes, layouts, range, seed } = suite;
         json!({
-            "tasks": tasks.iter().map(TaskId::to_string).collect::<Vec<_>>(),
+            "tasks": tasks.iter().map(|task| task.id.to_string()).collect::<Vec<_>>(),
             "episodes": episodes,
             "layouts": layouts,
             "seeds_from": range.first(),

@@ -6,7 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use decision::{Setting, Strategy};
 use evaluation::result_file::ResultFile;
-use evaluation::suite::{LAYOUTS, Layouts};
+use evaluation::suite::Layouts;
 use evaluation::table;
 use runtime::servers::Host;
 use store::plan::SeedRange;
@@ -21,10 +21,10 @@ pub struct Arguments {
     /// greedy, sample, first-well-formed, majority, medoid, verifier, worst, verifier+medoid, oracle; separated by commas.
     #[arg(long, value_delimiter = ',', default_value = "greedy,sample,verifier")]
     strategies: Vec<Strategy>,
-    /// Episodes of each task.
-    #[arg(long, default_value_t = LAYOUTS)]
+    /// Episodes of each task; with 24, each of SIMPLER's layouts once.
+    #[arg(long, default_value_t = 24)]
     episodes: u32,
-    /// The fixed initial layouts of each task (24 for SIMPLER's), or random ones from the held-out range.
+    /// Each task's fixed initial layouts, over and over, or random ones from the held-out range.
     #[arg(long, value_enum, default_value = "grid")]
     layouts: Layouts,
     /// Candidates per step; several, separated by commas, give success against N.

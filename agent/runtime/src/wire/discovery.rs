@@ -15,6 +15,8 @@ use tokio::time::{Instant, sleep_until};
 use zenoh::Session;
 use zenoh::sample::{Sample, SampleKind};
 
+use crate::fault::printable;
+
 /// A server that does not answer a query in this time is asked again: the first query may be faster than routing.
 const DESCRIBE_TIMEOUT: Duration = Duration::from_secs(2);
 /// The first pause between two queries to a server that did not describe itself, doubled each time.
@@ -152,7 +154,7 @@ impl Discovery {
                 let pause = retries.get(&server).map_or(DESCRIBE_PAUSE, |(_, pause)| *pause * 2);
                 let pause = pause.min(DESCRIBE_PAUSE_MAX);
                 retries.insert(server.clone(), (Instant::now() + pause, pause));
-                let reason = format!("{error:#}");
+                let reason = printable(&format!("{error:#}"));
                 self.fleet.send_if_modified(|fleet| {
                     let is_new = fleet.undescribed.get(&server) != Some(&reason);
                     if is_new {

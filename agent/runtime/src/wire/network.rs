@@ -106,6 +106,9 @@ impl Network {
             .iter()
             .chain(&options.listen)
             .try_for_each(|place| check_endpoint(place))?;
+        for place in &options.connect {
+            check_host(place).await?;
+        }
         let here = options.listen_here.then(|| local_endpoint(&tempfile::env::temp_dir()));
         let here = here.transpose()?;
         let (here, folder) = here.unzip();
@@ -119,7 +122,7 @@ impl Network {
             discovery,
             timing,
             listening,
-            is_remote: !options.connect.is_empty(),
+            is_remote: !options.connect.is_empty() || !options.listen.is_empty(),
             _folder: folder.flatten().map(Arc::new),
         })
     }
@@ -191,6 +194,13 @@ pub fn check_endpoint(endpoint: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// An error for a host whose name nobody knows; zenoh would ask for it again for as long as it may.
+async fn check_host(endpoint: &str) -> anyhow::Result<()> {
+    let Some(address) = endpoint.strip_prefix("tcp/") else { return Ok(()) };
+    let known = tokio::net::lookup_host(address).await;
+    known.map(drop).map_err(|error| anyhow!("endpoint {endpoint}: {error}"))
+}
+
 async fn open_session(
     options: &NetworkOptions,
     listen: &[String],
@@ -257,5 +267,15 @@ mod tests {
                 "{error}"
             );
         }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_host_that_nobody_knows_is_named_at_once() {
+        let begun = std::time::Instant::now();
+        let connect = vec!["tcp/host.invalid:7447".to_owned()];
+        let options = NetworkOptions { connect, listen_here: false, ..NetworkOptions::default() };
+        let error = Network::open(options).await.expect_err("no such host").to_string();
+        assert!(error.starts_with("endpoint tcp/host.invalid:7447: "), "{error}");
+        assert!(begun.elapsed() < Duration::from_secs(20), "{:?}", begun.elapsed());
     }
 }

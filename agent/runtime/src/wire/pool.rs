@@ -21,6 +21,8 @@ use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 
 /// A server that refused, most often because it is full, is asked again after this long.
 const REFUSED_PAUSE: Duration = Duration::from_secs(1);
+/// A run without any session says after this long what it waits for.
+const WAITING_TOLD: Duration = Duration::from_secs(2);
 /// Where every server that offers the task is unfit for the run, another one is waited for no longer than this.
 const INCOMPATIBLE_WAIT: Duration = Duration::from_secs(2);
 /// The first time for which a server that did not answer is left out, doubled each time.
@@ -60,10 +62,14 @@ pub struct ZenohPool {
 struct State {
     /// All episodes of a run happen in one simulator of one version.
     simulator: Option<String>,
+    /// Tasks as the first server that opened a session of them describes them.
+    tasks: BTreeMap<TaskId, TaskDescription>,
     /// Sessions without an episode, and whether their observations carry the expert's action.
     idle: Vec<(Session<Environment>, bool)>,
     /// Sessions of this run by server, those that are being opened included.
     in_use: BTreeMap<String, usize>,
+    /// How many of these are being opened.
+    opening: usize,
     /// Servers that have opened a session.
     proven: BTreeSet<String>,
     /// Servers that are left out, until when.
@@ -74,6 +80,8 @@ struct State {
     refusals: BTreeMap<String, String>,
     /// Since when this run has had no session.
     idle_since: Option<Instant>,
+    /// Whether it was said what it waits for.
+    is_waiting_told: bool,
 }
 
 struct Backoff {
@@ -141,6 +149,7 @@ impl ZenohPool {
             task: offered(chosen, &request.task)?.clone(),
         };
         state.add(&chosen.server, 1);
+        state.opening += 1;
         // A session's kind is settled when it is opened: one of the other kind makes room.
         let other = state.idle.iter().position(|(idle, _)| idle.info.server == chosen.server);
         if let Some(index) = other {
@@ -163,6 +172,10 @@ impl ZenohPool {
                 )
             } else if let Some(expected) = state.simulator.as_ref().filter(|run| **run != own) {
                 format!("expected the run's simulator, {expected}, got {own}")
+            } else if let Some(difference) =
+                state.tasks.get(task).and_then(|first| difference(first, offer))
+            {
+                format!("task {task}: {difference}")
             } else {
                 continue;
             };
@@ -190,6 +203,7 @@ impl ZenohPool {
         let Chosen { server, simulator, task } = chosen;
         let opened = Environment::open(&self.network, &server, open).await;
         let mut state = self.state();
+        state.opening -= 1;
         self.freed.notify_waiters();
         match opened {
             Ok(environment) => {
@@ -201,9 +215,11 @@ impl ZenohPool {
                         reason: format!("expected the run's simulator, {run}, got {simulator}"),
                     });
                 }
+                state.tasks.entry(request.task.clone()).or_insert_with(|| task.clone());
                 state.proven.insert(server.clone());
                 state.refusals.remove(&server);
                 state.idle_since = None;
+                state.is_waiting_told = false;
                 Ok(Session { info: SessionInfo { server, simulator, task }, environment })
             }
             Err(fault) => {
@@ -237,11 +253,14 @@ impl ZenohPool {
             bail!("{reason}");
         }
         let mut state = self.state();
-        if state.in_use.values().sum::<usize>() > state.idle.len() {
+        if state.in_use.values().sum::<usize>() > state.idle.len() + state.opening {
             state.idle_since = None;
             return Ok(());
         }
         let waits = *state.idle_since.get_or_insert_with(Instant::now);
+        if waits.elapsed() >= WAITING_TOLD && !std::mem::replace(&mut state.is_waiting_told, true) {
+            tracing::warn!("waiting for a session of {}: {}", request.task, state.reasons(fleet));
+        }
         let had_any = !state.proven.is_empty() || !state.backoff.is_empty();
         let all = fleet.servers.values();
         let mut offering = all.filter(|server| offered(server, &request.task).is_some());
@@ -368,6 +387,28 @@ impl State {
 /// What a server offers of a task.
 fn offered<'a>(server: &'a Description, task: &TaskId) -> Option<&'a TaskDescription> {
     server.tasks.iter().find(|one| one.task == task.task && one.variant == task.variant)
+}
+
+/// What of a task is not as the run's first server describes it.
+fn difference(first: &TaskDescription, offer: &TaskDescription) -> Option<String> {
+    let (name, expected, got) = texts(first)
+        .into_iter()
+        .zip(texts(offer))
+        .map(|((name, expected), (_, got))| (name, expected, got))
+        .find(|(_, expected, got)| expected != got)?;
+    Some(format!("expected {name} of the run's other episodes, {expected}, got {got}"))
+}
+
+/// What all servers of a run must say alike of a task.
+fn texts(task: &TaskDescription) -> [(&'static str, String); 6] {
+    [
+        ("the instruction", format!("{:?}", task.instruction)),
+        ("the horizon", task.steps_max.to_string()),
+        ("the control rate", format!("{:?}", task.control_hz)),
+        ("the number of layouts", task.layouts.to_string()),
+        ("the state", format!("{:?}", task.state)),
+        ("the action", format!("{:?}", task.action)),
+    ]
 }
 
 /// What a run's episodes must have in common: a task of another version has other results.
