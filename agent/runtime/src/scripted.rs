@@ -218,7 +218,7 @@ fn observation(instruction: &str) -> Observation {
     }
 }
 
-fn description(task: &str) -> TaskDescription {
+pub(crate) fn description(task: &str) -> TaskDescription {
     let names = ["x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "gripper"];
     let dimension =
         |name: &str| Dimension { name: name.to_owned(), low: None, high: None, discrete: false };

@@ -80,7 +80,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     if let Some(local) = &source.local {
         let python = check(&mut findings, "python", || check_python(local));
         if let Some(python) = python {
-            check(&mut findings, "rendering", || check_rendering(&python));
+            check(&mut findings, "rendering", || check_rendering(&python, local));
             program = check(&mut findings, "simulator", || check_simulator(local));
         }
     }
@@ -146,8 +146,8 @@ fn check_python(local: &LocalSource) -> Result<(PythonEnvironment, String)> {
     Ok((python, format!("{text} ({place})")))
 }
 
-fn check_rendering(python: &PythonEnvironment) -> Result<((), String)> {
-    python.ensure_rendering(Missing::Report)?;
+fn check_rendering(python: &PythonEnvironment, local: &LocalSource) -> Result<((), String)> {
+    python.ensure_rendering(&local.installation, Missing::Report)?;
     Ok(((), "one image rendered with software OpenGL (EGL)".to_owned()))
 }
 

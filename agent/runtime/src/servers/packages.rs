@@ -152,7 +152,8 @@ impl PackageList<'_> {
         };
         let Err(error) = first else { return Ok(()) };
         // A half-made folder of the first attempt is completed by the second.
-        let is_installed = install_missing(&PYTHON_PACKAGES, Missing::Install)
+        let variables = &self.installation.host.variables;
+        let is_installed = install_missing(&PYTHON_PACKAGES, variables, Missing::Install)
             .with_context(|| format!("cannot create a Python environment ({error:#})"))?;
         if !is_installed {
             return Err(error);

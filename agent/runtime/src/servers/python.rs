@@ -60,9 +60,9 @@ impl PythonEnvironment {
 
     /// Makes sure that an image can be rendered without a screen or a graphics card. System packages are installed only
     /// when that fails and some are found to be missing.
-    pub fn ensure_rendering(&self, missing: Missing) -> Result<()> {
+    pub fn ensure_rendering(&self, installation: &Installation, missing: Missing) -> Result<()> {
         let Err(error) = self.render_one_image() else { return Ok(()) };
-        let is_installed = install_missing(&GL_PACKAGES, missing)
+        let is_installed = install_missing(&GL_PACKAGES, &installation.host.variables, missing)
             .with_context(|| format!("cannot render an image with software OpenGL ({error})"))?;
         ensure!(is_installed, "cannot render an image with software OpenGL: {error}");
         self.render_one_image()
@@ -135,7 +135,7 @@ fn environment_with(
                 let is_for_tests = lock.ends_with(DEVELOPMENT_LOCK);
                 list.install_once(digest, || match is_for_tests {
                     true => Ok(()),
-                    false => environment.ensure_rendering(Missing::Install),
+                    false => environment.ensure_rendering(installation, Missing::Install),
                 })?;
             }
         }

@@ -9,6 +9,7 @@ mod environment;
 mod episode;
 mod local_endpoint;
 mod network;
+mod offer;
 mod outcomes;
 mod pool;
 mod probe;

@@ -14,6 +14,7 @@ use tokio::sync::{Notify, watch};
 use tokio::time::Instant;
 
 use super::discovery::Fleet;
+use super::offer::{difference, offered, simulator};
 use super::{Environment, Network};
 use crate::fault::EnvironmentFault;
 use crate::servers::LocalServers;
@@ -382,43 +383,4 @@ impl State {
         reasons.extend(described(&fleet.undescribed));
         if reasons.is_empty() { "no server is alive".to_owned() } else { reasons.join("; ") }
     }
-}
-
-/// What a server offers of a task.
-fn offered<'a>(server: &'a Description, task: &TaskId) -> Option<&'a TaskDescription> {
-    server.tasks.iter().find(|one| one.task == task.task && one.variant == task.variant)
-}
-
-/// What of a task is not as the run's first server describes it.
-fn difference(first: &TaskDescription, offer: &TaskDescription) -> Option<String> {
-    let (name, expected, got) = texts(first)
-        .into_iter()
-        .zip(texts(offer))
-        .map(|((name, expected), (_, got))| (name, expected, got))
-        .find(|(_, expected, got)| expected != got)?;
-    Some(format!("expected {name} of the run's other episodes, {expected}, got {got}"))
-}
-
-/// What all servers of a run must say alike of a task.
-fn texts(task: &TaskDescription) -> [(&'static str, String); 6] {
-    [
-        ("the instruction", format!("{:?}", task.instruction)),
-        ("the horizon", task.steps_max.to_string()),
-        ("the control rate", format!("{:?}", task.control_hz)),
-        ("the number of layouts", task.layouts.to_string()),
-        ("the state", format!("{:?}", task.state)),
-        ("the action", format!("{:?}", task.action)),
-    ]
-}
-
-/// What a run's episodes must have in common: a task of another version has other results.
-pub(crate) fn simulator(server: &Description) -> String {
-    let name = format!("{} {}", server.simulator, server.simulator_version);
-    let versions: BTreeSet<u32> = server.tasks.iter().map(|task| task.version).collect();
-    // Left out where every task is its first version, as in runs from before there was a second.
-    if versions.iter().all(|&version| version == 1) {
-        return name;
-    }
-    let versions: Vec<String> = versions.iter().map(u32::to_string).collect();
-    format!("{name}, task version {}", versions.join(" and "))
 }

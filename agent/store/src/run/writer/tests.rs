@@ -231,15 +231,12 @@ fn a_reader_needs_no_permission_to_write() {
     let path = run.folder.clone();
     drop(run);
     let set = |mode: u32| {
-        let set = |path: &Path, mode| {
+        for (path, mode) in [(path.join(INDEX), mode & 0o666), (path.clone(), mode)] {
             std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).expect("a mode");
-        };
-        set(&path.join(INDEX), mode & 0o666);
-        set(&path, mode);
+        }
     };
     set(0o555);
-    let read = summaries(&path);
-    let index = index::read(&path);
+    let (read, index) = (summaries(&path), index::read(&path));
     set(0o755);
     assert_eq!(episodes(&read.expect("readable")), [0]);
     assert_eq!(index.expect("a usable index").len(), 1);
