@@ -69,7 +69,7 @@ async fn decide_batches(
     mut received: mpsc::Receiver<Waiting>,
     active: Arc<AtomicUsize>,
 ) {
-    let parallel = decider.policy().info().parallel_calls;
+    let parallel = decider.policy().info().parallel_calls.max(1);
     let calls = Arc::new(Semaphore::new(parallel));
     loop {
         // A batch grows while it waits for its turn.
@@ -121,5 +121,18 @@ async fn decide(decider: &Decider, mut batch: Vec<Waiting>) {
         let answer = Answer { context: one.context, decision, batch_time, batch_size };
         // The episode may have been dropped meanwhile.
         let _ = one.answer.send(answer);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn batches_side_by_side_share_the_running_episodes_and_few_episodes_stay_together() {
+        let shares = |parallel: usize| [1, 2, 5, 6, 8, 16].map(|active| share(active, parallel));
+        assert_eq!(shares(1), [1, 2, 5, 6, 8, 16]);
+        assert_eq!(shares(2), [1, 2, 5, 3, 4, 8]);
+        assert_eq!(shares(16), [1, 2, 5, 3, 4, 4]);
     }
 }

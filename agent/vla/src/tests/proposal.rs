@@ -51,6 +51,27 @@ fn a_request_does_not_depend_on_the_requests_beside_it() -> Result<()> {
 }
 
 #[test]
+fn calls_side_by_side_answer_as_calls_one_after_the_other() -> Result<()> {
+    let policy = tiny("tiny", Backend::Kernels)?;
+    let images: Vec<Image> = (0..12).map(|seed| image(seed, policy.info().image_size.0)).collect();
+    let requests: Vec<_> = images.iter().map(|image| request(image, 5, 1.0, 9)).collect();
+    let calls: Vec<&[ProposalRequest<'_>]> = requests.chunks(4).collect();
+    let alone: Vec<_> = calls.iter().map(|call| policy.propose_now(call)).collect::<Result<_>>()?;
+    let propose = |call: usize| (0..4).map(move |_| policy.propose_now(calls[call]));
+    let propose = &propose;
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = (0..3)
+            .map(|call| scope.spawn(move || propose(call).collect::<Result<Vec<_>>>()))
+            .collect();
+        for (thread, expected) in threads.into_iter().zip(&alone) {
+            let proposals = thread.join().expect("no panic").expect("proposals");
+            assert!(proposals.iter().all(|proposals| proposals == expected));
+        }
+    });
+    Ok(())
+}
+
+#[test]
 fn threads_do_not_change_a_bit() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
     let image = image(3, policy.info().image_size.0);
