@@ -95,6 +95,20 @@ fn every_layout_and_random_ones_are_equal_bit_for_bit() {
     }
 }
 
+/// A shape that leaves the picture is left out of drawing: at its edges too early or too late would be seen.
+#[test]
+fn pictures_of_an_arm_that_sweeps_across_their_edges_are_equal_bit_for_bit() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("actions.txt");
+    let to_the_left = "0 0.04 0 0 0 0 1\n".repeat(15);
+    let to_the_right = "0 -0.04 0 0 0 0 1\n".repeat(30);
+    let and_turned = "0.02 0.04 -0.01 0.2 0 0 -1\n".repeat(15);
+    std::fs::write(&file, to_the_left + &to_the_right + &and_turned).expect("written");
+    let file = file.to_str().expect("a readable path");
+    let lines = assert_equal_traces(&["--layouts", "3", "--actions", file]);
+    assert!(lines > 7 * 60, "expected a reset and an episode's steps of each, got {lines} lines");
+}
+
 /// A file of actions far from what the expert would do.
 fn wild_actions(folder: &Path, count: usize) -> String {
     let file = folder.join("actions.txt");

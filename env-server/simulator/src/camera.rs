@@ -138,7 +138,11 @@ impl Renderer {
 fn keep_inside(scene: &mut MjvScene) {
     // SAFETY: shapes are only put into another order, and fewer counted.
     let scene = unsafe { scene.ffi_mut() };
-    let camera = &scene.camera[0];
+    let [left_eye, right_eye] = &scene.camera;
+    let camera = left_eye;
+    // MuJoCo draws from between the eyes unless the picture is stereoscopic.
+    let position: [f32; 3] =
+        std::array::from_fn(|axis| f32::midpoint(left_eye.pos[axis], right_eye.pos[axis]));
     let (forward, up) = (camera.forward, camera.up);
     let right = [
         forward[1] * up[2] - forward[2] * up[1],
@@ -152,7 +156,7 @@ fn keep_inside(scene: &mut MjvScene) {
     let wide = camera.frustum_width / camera.frustum_near;
     let high = camera.frustum_top / camera.frustum_near;
     let is_outside = |geom: &mujoco_rs::mujoco_c::mjvGeom| {
-        let offset = std::array::from_fn(|axis| geom.pos[axis] - camera.pos[axis]);
+        let offset = std::array::from_fn(|axis| geom.pos[axis] - position[axis]);
         let depth = dot(offset, forward);
         let beyond = |across: f32, slope: f32| (across.abs() - slope * depth) / slope.hypot(1.0);
         let beyond = [beyond(dot(offset, right), wide), beyond(dot(offset, up), high), -depth];
