@@ -12,6 +12,7 @@ mod network;
 mod offer;
 mod outcomes;
 mod pool;
+mod pool_state;
 mod probe;
 mod verifier_updates;
 

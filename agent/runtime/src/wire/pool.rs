@@ -1,9 +1,10 @@
 //! The sessions of a run: opened where there is room, used for one episode after the other.
 //!
-//! Each episode waits for its own session alone. A server that does not answer costs the episodes that it has: it is left
-//! out for a while that grows, and until it has opened one session it is asked for one at a time.
+//! Sessions are opened in the background, and an episode takes the first that is free. A server that does not answer costs
+//! the episodes that it has: it is left out for a while that grows, and until it has opened one session it is asked for
+//! one at a time.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::pin::pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -15,19 +16,18 @@ use tokio::time::Instant;
 
 use super::discovery::Fleet;
 use super::offer::{difference, offered, simulator};
+use super::pool_state::{BACKOFF, REFUSED_PAUSE, State};
 use super::{Environment, Network};
 use crate::fault::EnvironmentFault;
 use crate::servers::LocalServers;
 use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 
-/// A server that refused, most often because it is full, is asked again after this long.
-const REFUSED_PAUSE: Duration = Duration::from_secs(1);
+/// An opening that takes longer is no longer counted on: another server is asked, too.
+const OPENING_USUAL: Duration = Duration::from_secs(5);
 /// A run without any session says after this long what it waits for.
 const WAITING_TOLD: Duration = Duration::from_secs(2);
 /// Where every server that offers the task is unfit for the run, another one is waited for no longer than this.
 const INCOMPATIBLE_WAIT: Duration = Duration::from_secs(2);
-/// The first time for which a server that did not answer is left out, doubled each time.
-const BACKOFF: Duration = Duration::from_secs(30);
 /// The longest such time.
 const BACKOFF_MAX: Duration = Duration::from_secs(600);
 
@@ -49,7 +49,9 @@ pub struct PoolOptions {
 }
 
 /// Opens sessions over zenoh.
-pub struct ZenohPool {
+pub struct ZenohPool(Arc<Pool>);
+
+struct Pool {
     network: Network,
     local: Option<Arc<LocalServers>>,
     options: PoolOptions,
@@ -59,39 +61,9 @@ pub struct ZenohPool {
     freed: Notify,
 }
 
-#[derive(Default)]
-struct State {
-    /// All episodes of a run happen in one simulator of one version.
-    simulator: Option<String>,
-    /// Tasks as the first server that opened a session of them describes them.
-    tasks: BTreeMap<TaskId, TaskDescription>,
-    /// Sessions without an episode, and whether their observations carry the expert's action.
-    idle: Vec<(Session<Environment>, bool)>,
-    /// Sessions of this run by server, those that are being opened included.
-    in_use: BTreeMap<String, usize>,
-    /// How many of these are being opened.
-    opening: usize,
-    /// Servers that have opened a session.
-    proven: BTreeSet<String>,
-    /// Servers that are left out, until when.
-    backoff: BTreeMap<String, Backoff>,
-    /// Why a server cannot serve this run at all; reported once.
-    incompatible: BTreeMap<String, String>,
-    /// What servers said last when they gave no session.
-    refusals: BTreeMap<String, String>,
-    /// Since when this run has had no session.
-    idle_since: Option<Instant>,
-    /// Whether it was said what it waits for.
-    is_waiting_told: bool,
-}
-
-struct Backoff {
-    until: Instant,
-    pause: Duration,
-}
-
 /// A server that may be asked.
 struct Chosen {
+    begun: Instant,
     server: String,
     simulator: String,
     task: TaskDescription,
@@ -106,9 +78,12 @@ impl ZenohPool {
     ) -> ZenohPool {
         let fleet = network.fleet();
         let state = State { simulator: options.simulator.clone(), ..State::default() };
-        ZenohPool { network, local, options, fleet, state: Mutex::new(state), freed: Notify::new() }
+        let (state, freed) = (Mutex::new(state), Notify::new());
+        ZenohPool(Arc::new(Pool { network, local, options, fleet, state, freed }))
     }
+}
 
+impl Pool {
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -133,6 +108,10 @@ impl ZenohPool {
     fn reserve(&self, request: &SessionRequest, fleet: &Fleet) -> Option<Chosen> {
         let mut state = self.state();
         let now = Instant::now();
+        let is_counted_on = |begun: &&Instant| now.duration_since(**begun) < OPENING_USUAL;
+        if state.opening.iter().filter(is_counted_on).count() >= state.waiting {
+            return None;
+        }
         self.check_compatible(&mut state, &request.task, fleet);
         let may_be_asked = |server: &&Description| {
             let id = &server.server;
@@ -145,14 +124,18 @@ impl ZenohPool {
         let fewest = |server: &&Description| state.in_use.get(&server.server).copied().unwrap_or(0);
         let chosen = fleet.servers.values().filter(may_be_asked).min_by_key(fewest)?;
         let chosen = Chosen {
+            begun: now,
             server: chosen.server.clone(),
             simulator: simulator(chosen),
             task: offered(chosen, &request.task)?.clone(),
         };
         state.add(&chosen.server, 1);
-        state.opening += 1;
+        state.opening.push(now);
         // A session's kind is settled when it is opened: one of the other kind makes room.
-        let other = state.idle.iter().position(|(idle, _)| idle.info.server == chosen.server);
+        let is_other = |(idle, has_expert): &(Session<Environment>, bool)| {
+            idle.info.server == chosen.server && *has_expert != request.needs_expert
+        };
+        let other = state.idle.iter().position(is_other);
         if let Some(index) = other {
             let (idle, _) = state.idle.swap_remove(index);
             state.add(&idle.info.server, -1);
@@ -187,11 +170,8 @@ impl ZenohPool {
         }
     }
 
-    async fn open(
-        &self,
-        chosen: Chosen,
-        request: &SessionRequest,
-    ) -> Result<Session<Environment>, EnvironmentFault> {
+    /// Opens a session, which is idle then, or notes why there is none.
+    async fn open(&self, chosen: Chosen, request: SessionRequest) {
         let open = Open {
             protocol: PROTOCOL_VERSION,
             task: request.task.task.clone(),
@@ -201,27 +181,24 @@ impl ZenohPool {
             expert: request.needs_expert,
             holder: self.options.holder.clone(),
         };
-        let Chosen { server, simulator, task } = chosen;
+        let Chosen { begun, server, simulator, task } = chosen;
         let opened = Environment::open(&self.network, &server, open).await;
         let mut state = self.state();
-        state.opening -= 1;
-        self.freed.notify_waiters();
+        state.opening.retain(|other| *other != begun);
         match opened {
             Ok(environment) => {
                 let run = state.simulator.get_or_insert_with(|| simulator.clone()).clone();
-                if run != simulator {
+                if run == simulator {
+                    state.tasks.entry(request.task).or_insert_with(|| task.clone());
+                    state.proven.insert(server.clone());
+                    state.refusals.remove(&server);
+                    let session =
+                        Session { info: SessionInfo { server, simulator, task }, environment };
+                    state.idle.push((session, request.needs_expert));
+                } else {
                     // Another server was faster; this one is reported when servers are looked at next.
                     state.add(&server, -1);
-                    return Err(EnvironmentFault::Refused {
-                        reason: format!("expected the run's simulator, {run}, got {simulator}"),
-                    });
                 }
-                state.tasks.entry(request.task.clone()).or_insert_with(|| task.clone());
-                state.proven.insert(server.clone());
-                state.refusals.remove(&server);
-                state.idle_since = None;
-                state.is_waiting_told = false;
-                Ok(Session { info: SessionInfo { server, simulator, task }, environment })
             }
             Err(fault) => {
                 state.add(&server, -1);
@@ -230,9 +207,10 @@ impl ZenohPool {
                     EnvironmentFault::Refused { .. } => state.ask_later(&server),
                     _ => self.suspect(&mut state, &server, &fault),
                 }
-                Err(fault)
             }
         }
+        drop(state);
+        self.freed.notify_waiters();
     }
 
     /// Leaves a server out for a while; one of this machine is killed and started again where it does not answer.
@@ -254,8 +232,9 @@ impl ZenohPool {
             bail!("{reason}");
         }
         let mut state = self.state();
-        if state.in_use.values().sum::<usize>() > state.idle.len() + state.opening {
+        if state.in_use.values().sum::<usize>() > state.idle.len() + state.opening.len() {
             state.idle_since = None;
+            state.is_waiting_told = false;
             return Ok(());
         }
         let waits = *state.idle_since.get_or_insert_with(Instant::now);
@@ -289,20 +268,22 @@ impl SessionPool for ZenohPool {
     type Environment = Environment;
 
     async fn acquire(&self, request: &SessionRequest) -> Result<Session<Environment>> {
-        let mut changes = self.fleet.clone();
+        let pool = &self.0;
+        let _waiting = Waiting::begin(pool);
+        let mut changes = pool.fleet.clone();
         loop {
-            let freed = self.freed.notified();
+            let mut freed = pin!(pool.freed.notified());
+            // From now on, whatever is freed while the pool is looked at is not missed.
+            freed.as_mut().enable();
             let fleet = changes.borrow_and_update().clone();
-            if let Some(session) = self.idle(request, &fleet) {
+            if let Some(session) = pool.idle(request, &fleet) {
                 return Ok(session);
             }
-            if let Some(chosen) = self.reserve(request, &fleet) {
-                if let Ok(session) = self.open(chosen, request).await {
-                    return Ok(session);
-                }
-                continue;
+            if let Some(chosen) = pool.reserve(request, &fleet) {
+                let (pool, request) = (Arc::clone(pool), request.clone());
+                tokio::spawn(async move { pool.open(chosen, request).await });
             }
-            self.check_patience(request, &fleet)?;
+            pool.check_patience(request, &fleet)?;
             // Sooner or later even where nothing changes: backoffs and patience end by the clock.
             let woken = async {
                 tokio::select! {
@@ -317,10 +298,11 @@ impl SessionPool for ZenohPool {
     }
 
     fn release(&self, session: Session<Environment>) {
-        let mut state = self.state();
+        let pool = &self.0;
+        let mut state = pool.state();
         let server = session.info.server.clone();
         state.backoff.remove(&server);
-        let fleet = self.fleet.borrow();
+        let fleet = pool.fleet.borrow();
         let in_use = |server: &String| state.in_use.get(server).copied().unwrap_or(0);
         let usable = fleet.servers.keys().filter(|id| !state.incompatible.contains_key(*id));
         let fewest = usable.map(in_use).min().unwrap_or(0);
@@ -333,54 +315,41 @@ impl SessionPool for ZenohPool {
         }
         drop(fleet);
         drop(state);
-        self.freed.notify_waiters();
+        pool.freed.notify_waiters();
     }
 
     fn lost(&self, info: &SessionInfo, fault: &EnvironmentFault) {
-        let mut state = self.state();
+        let pool = &self.0;
+        let mut state = pool.state();
         state.add(&info.server, -1);
         match fault {
-            EnvironmentFault::TimedOut { .. } => self.suspect(&mut state, &info.server, fault),
+            EnvironmentFault::TimedOut { .. } => pool.suspect(&mut state, &info.server, fault),
             EnvironmentFault::ServerLost { .. } | EnvironmentFault::LinkLost { .. } => {
                 state.idle.retain(|(session, _)| session.info.server != info.server);
-                if let Some(local) = &self.local {
+                if let Some(local) = &pool.local {
                     local.replace(&info.server);
                 }
             }
-            EnvironmentFault::Wire { .. } => self.suspect(&mut state, &info.server, fault),
+            EnvironmentFault::Wire { .. } => pool.suspect(&mut state, &info.server, fault),
             EnvironmentFault::Refused { .. } | EnvironmentFault::Faulted { .. } => {}
         }
         drop(state);
-        self.freed.notify_waiters();
+        pool.freed.notify_waiters();
     }
 }
 
-impl State {
-    fn add(&mut self, server: &str, more: isize) {
-        let count = self.in_use.entry(server.to_owned()).or_default();
-        *count = count.saturating_add_signed(more);
-    }
+/// An episode that waits for a session, until it has one or waits no longer.
+struct Waiting<'a>(&'a Pool);
 
-    fn pause(&mut self, server: &str, pause: Duration) {
-        let backoff = Backoff { until: Instant::now() + pause, pause };
-        self.backoff.insert(server.to_owned(), backoff);
+impl Waiting<'_> {
+    fn begin(pool: &Pool) -> Waiting<'_> {
+        pool.state().waiting += 1;
+        Waiting(pool)
     }
+}
 
-    /// For a server that answered, and has no room.
-    fn ask_later(&mut self, server: &str) {
-        let until = Instant::now() + REFUSED_PAUSE;
-        let backoff = self.backoff.entry(server.to_owned());
-        backoff.or_insert(Backoff { until, pause: BACKOFF / 2 }).until = until;
-    }
-
-    /// Why there is no session.
-    fn reasons(&self, fleet: &Fleet) -> String {
-        let mut reasons: Vec<String> = self.refusals.values().cloned().collect();
-        let described = |all: &BTreeMap<String, String>| -> Vec<String> {
-            all.iter().map(|(server, reason)| format!("server {server}: {reason}")).collect()
-        };
-        reasons.extend(described(&self.incompatible));
-        reasons.extend(described(&fleet.undescribed));
-        if reasons.is_empty() { "no server is alive".to_owned() } else { reasons.join("; ") }
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        self.0.state().waiting -= 1;
     }
 }

@@ -57,12 +57,14 @@ fn calls_side_by_side_answer_as_calls_one_after_the_other() -> Result<()> {
     let requests: Vec<_> = images.iter().map(|image| request(image, 5, 1.0, 9)).collect();
     let calls: Vec<&[ProposalRequest<'_>]> = requests.chunks(4).collect();
     let alone: Vec<_> = calls.iter().map(|call| policy.propose_now(call)).collect::<Result<_>>()?;
-    let propose = |call: usize| (0..4).map(move |_| policy.propose_now(calls[call]));
-    let propose = &propose;
     std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..3)
-            .map(|call| scope.spawn(move || propose(call).collect::<Result<Vec<_>>>()))
-            .collect();
+        let policy = &policy;
+        let threads = calls.iter().map(|&call| {
+            let again =
+                move || (0..4).map(|_| policy.propose_now(call)).collect::<Result<Vec<_>>>();
+            scope.spawn(again)
+        });
+        let threads: Vec<_> = threads.collect();
         for (thread, expected) in threads.into_iter().zip(&alone) {
             let proposals = thread.join().expect("no panic").expect("proposals");
             assert!(proposals.iter().all(|proposals| proposals == expected));
