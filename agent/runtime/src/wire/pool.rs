@@ -22,8 +22,6 @@ use crate::fault::EnvironmentFault;
 use crate::servers::LocalServers;
 use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 
-/// An opening that takes longer is no longer counted on: another server is asked, too.
-const OPENING_USUAL: Duration = Duration::from_secs(5);
 /// A run without any session says after this long what it waits for.
 const WAITING_TOLD: Duration = Duration::from_secs(2);
 /// Where every server that offers the task is unfit for the run, another one is waited for no longer than this.
@@ -108,8 +106,7 @@ impl Pool {
     fn reserve(&self, request: &SessionRequest, fleet: &Fleet) -> Option<Chosen> {
         let mut state = self.state();
         let now = Instant::now();
-        let is_counted_on = |begun: &&Instant| now.duration_since(**begun) < OPENING_USUAL;
-        if state.opening.iter().filter(is_counted_on).count() >= state.waiting {
+        if state.is_enough_opening() {
             return None;
         }
         self.check_compatible(&mut state, &request.task, fleet);
@@ -130,7 +127,7 @@ impl Pool {
             task: offered(chosen, &request.task)?.clone(),
         };
         state.add(&chosen.server, 1);
-        state.opening.push(now);
+        state.opening.push((now, chosen.server.clone()));
         // A session's kind is settled when it is opened: one of the other kind makes room.
         let is_other = |(idle, has_expert): &(Session<Environment>, bool)| {
             idle.info.server == chosen.server && *has_expert != request.needs_expert
@@ -184,7 +181,10 @@ impl Pool {
         let Chosen { begun, server, simulator, task } = chosen;
         let opened = Environment::open(&self.network, &server, open).await;
         let mut state = self.state();
-        state.opening.retain(|other| *other != begun);
+        let this = (begun, server.clone());
+        if let Some(index) = state.opening.iter().position(|other| *other == this) {
+            state.opening.swap_remove(index);
+        }
         match opened {
             Ok(environment) => {
                 let run = state.simulator.get_or_insert_with(|| simulator.clone()).clone();

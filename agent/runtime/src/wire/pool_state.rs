@@ -13,6 +13,8 @@ use crate::session::Session;
 
 /// A server that refused, most often because it is full, is asked again after this long.
 pub const REFUSED_PAUSE: Duration = Duration::from_secs(1);
+/// Until a server has opened one session, an opening that takes longer is no longer counted on: another server is asked, too.
+const OPENING_USUAL: Duration = Duration::from_secs(5);
 /// The first time for which a server that did not answer is left out, doubled each time.
 pub const BACKOFF: Duration = Duration::from_secs(30);
 
@@ -27,8 +29,8 @@ pub struct State {
     pub idle: Vec<(Session<Environment>, bool)>,
     /// Sessions of this run by server, those that are being opened included.
     pub in_use: BTreeMap<String, usize>,
-    /// Since when some of these are being opened.
-    pub opening: Vec<Instant>,
+    /// Those of them that are being opened: since when, and on which server.
+    pub opening: Vec<(Instant, String)>,
     /// Episodes that wait for a session.
     pub waiting: usize,
     /// Servers that have opened a session.
@@ -52,6 +54,14 @@ pub struct Backoff {
 }
 
 impl State {
+    /// Whether the sessions that are being opened will do for the episodes that wait.
+    pub fn is_enough_opening(&self) -> bool {
+        let is_counted_on = |(begun, server): &&(Instant, String)| {
+            self.proven.contains(server) || begun.elapsed() < OPENING_USUAL
+        };
+        self.opening.iter().filter(is_counted_on).count() >= self.waiting
+    }
+
     pub fn add(&mut self, server: &str, more: isize) {
         let count = self.in_use.entry(server.to_owned()).or_default();
         *count = count.saturating_add_signed(more);
