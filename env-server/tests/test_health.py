@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from conftest import free_endpoint
+
 from rever_env.tasks import TaskId, load
 
 

@@ -99,7 +99,8 @@ def test_an_episode_ends_at_the_horizon_and_refuses_more(endpoint: str) -> None:
     remote.reset(seed=0)
     ends = [remote.step(STILL)[2:4] for _ in range(60)]
     assert ends == [(False, False)] * 59 + [(False, True)]
-    with pytest.raises(RemoteRefused, match="step 61: expected at most 60; reset begins a new episode"):
+    words = "step 61: expected at most 60; reset begins a new episode"
+    with pytest.raises(RemoteRefused, match=words):
         remote.step(STILL)
     remote.reset(seed=0)
     remote.close()
