@@ -213,8 +213,14 @@ fn a_task_that_no_policy_fits_is_refused_in_words() {
         let mut evaluate = rever();
         evaluate.current_dir(folder.path());
         evaluate.args(["evaluate", "--connect", endpoint, "--tasks", "CartPole-v1"]);
-        evaluate.args(["--strategies", "greedy", "--episodes", "1", "--out"]);
-        let output = run(evaluate.arg(folder.path().join("run")));
+        evaluate.args(["--strategies", "greedy", "--episodes", "1"]);
+        let mut on_the_grid = rever();
+        on_the_grid.args(evaluate.get_args()).current_dir(folder.path());
+        let output = run(&mut on_the_grid);
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains("layouts: expected random ones for CartPole-v1"), "{said}");
+        let output = run(evaluate.args(["--layouts", "random"]));
         let said = text(&output);
         assert_eq!(output.status.code(), Some(1), "{said}");
         let words = "expected actions of 7 numbers, as the policy's are, got 1";
