@@ -80,11 +80,7 @@ impl Sinks {
         let (events, received) = mpsc::channel(WAITING_MAX);
         let failure = Arc::new(Mutex::new(None));
         let failed = Arc::clone(&failure);
-        let run = move || {
-            if let Err(error) = drain(sinks, received) {
-                *lock(&failed) = Some(format!("{error:#}"));
-            }
-        };
+        let run = move || drain(sinks, received, &failed);
         let thread = std::thread::Builder::new()
             .name("event sinks".to_owned())
             .spawn(run)
@@ -120,24 +116,32 @@ impl Sinks {
         }
     }
 
-    /// Why the thread has ended. It may still be about to say so.
+    /// Why the thread has ended.
     fn failed(&self) -> Error {
         let reason = lock(&self.failure).clone();
         anyhow!(reason.unwrap_or_else(|| "an event sink failed".to_owned()))
     }
 }
 
-fn drain(mut sinks: Vec<Box<dyn EventSink>>, mut received: mpsc::Receiver<Message>) -> Result<()> {
+/// A failure is noted before the channels are dropped: whoever sees that they are finds its reason.
+fn drain(
+    mut sinks: Vec<Box<dyn EventSink>>,
+    mut received: mpsc::Receiver<Message>,
+    failure: &Mutex<Option<String>>,
+) {
+    let note = |error: Error| *lock(failure) = Some(format!("{error:#}"));
     while let Some(Message { event, taken }) = received.blocking_recv() {
-        for sink in &mut sinks {
-            sink.on(&event)?;
+        if let Err(error) = sinks.iter_mut().try_for_each(|sink| sink.on(&event)) {
+            return note(error);
         }
         if let Some(taken) = taken {
             // The episode may have been dropped meanwhile; its record is kept all the same.
             let _ = taken.send(());
         }
     }
-    sinks.iter_mut().try_for_each(|sink| sink.finish())
+    if let Err(error) = sinks.iter_mut().try_for_each(|sink| sink.finish()) {
+        note(error);
+    }
 }
 
 fn lock(failure: &Mutex<Option<String>>) -> MutexGuard<'_, Option<String>> {
