@@ -202,8 +202,8 @@ impl EpisodesArguments {
         LabelStore::open(&self.labels).map(drop)
     }
 
-    /// The tasks that were asked for, or all that servers offer. The servers must run for it where they alone can say which
-    /// tasks or layouts there are.
+    /// The tasks that were asked for, or all that servers offer. Servers are started here only where their descriptions are
+    /// needed: for the list of tasks, or for the number of fixed layouts.
     fn tasks(
         &self,
         layouts: Layouts,

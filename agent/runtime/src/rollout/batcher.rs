@@ -12,8 +12,8 @@ use tokio::runtime::Handle;
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
 
-/// How long a batch waits for the running episodes that it lacks: a pass over many costs little more than one over few, so
-/// that waiting for a step is worth it, and waiting for a slow server is not.
+/// How long a batch waits for its share of the running episodes: long enough for a step of a usual server, so that
+/// batches stay even, and too short to notice a slow one.
 const BATCH_WAIT: Duration = Duration::from_millis(15);
 /// Batches that are decided side by side have at least so many episodes each: smaller ones share too little.
 const EPISODES_MIN: usize = 3;

@@ -123,7 +123,7 @@ impl Sinks {
     }
 }
 
-/// A failure is noted before the channels are dropped: whoever sees that they are finds its reason.
+/// Notes a failure before the channels close. A caller that finds them closed can then read the reason.
 fn drain(
     mut sinks: Vec<Box<dyn EventSink>>,
     mut received: mpsc::Receiver<Message>,

@@ -189,7 +189,7 @@ impl Discovery {
         let Some(server) = keys.server_of(sample.key_expr().as_str()) else { return };
         let alive = sample.kind() == SampleKind::Put;
         if !alive {
-            // Before its status, so that whoever learns of the loss no longer finds it in the fleet.
+            // First the fleet, then the status: code that reacts to the loss must not find the server in the fleet.
             self.forget(|name| name != server);
         }
         self.update(server, |status| {

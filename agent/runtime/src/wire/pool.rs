@@ -16,7 +16,7 @@ use tokio::time::Instant;
 
 use super::discovery::Fleet;
 use super::offer::{difference, offered, simulator};
-use super::pool_state::{BACKOFF, REFUSED_PAUSE, State};
+use super::pool_state::{BACKOFF, BACKOFF_MAX, REFUSED_PAUSE, State};
 use super::{Environment, Network};
 use crate::fault::EnvironmentFault;
 use crate::servers::LocalServers;
@@ -26,8 +26,6 @@ use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 const WAITING_TOLD: Duration = Duration::from_secs(2);
 /// Where every server that offers the task is unfit for the run, another one is waited for no longer than this.
 const INCOMPATIBLE_WAIT: Duration = Duration::from_secs(2);
-/// The longest such time.
-const BACKOFF_MAX: Duration = Duration::from_secs(600);
 
 /// What the sessions of a run have in common.
 #[derive(Debug, Clone)]
@@ -140,7 +138,8 @@ impl Pool {
         Some(chosen)
     }
 
-    /// Notes and reports servers whose simulator is not the run's, or whose task the policy cannot act in.
+    /// Notes and reports servers whose simulator is not the run's, that describe the task in another way than the run's
+    /// first server, or whose task the policy cannot act in.
     fn check_compatible(&self, state: &mut State, task: &TaskId, fleet: &Fleet) {
         state.incompatible.retain(|server, _| fleet.servers.contains_key(server));
         for (id, server) in &fleet.servers {
@@ -167,8 +166,9 @@ impl Pool {
         }
     }
 
-    /// Opens a session, which is idle then, or notes why there is none.
-    async fn open(&self, chosen: Chosen, request: SessionRequest) {
+    /// Opens a session in the background. The task does not keep the pool: its local servers end with the run, even while
+    /// another server has not answered.
+    fn open(self: &Arc<Self>, chosen: Chosen, request: SessionRequest) {
         let open = Open {
             protocol: PROTOCOL_VERSION,
             task: request.task.task.clone(),
@@ -178,8 +178,23 @@ impl Pool {
             expert: request.needs_expert,
             holder: self.options.holder.clone(),
         };
+        let (network, pool) = (self.network.clone(), Arc::downgrade(self));
+        tokio::spawn(async move {
+            let opened = Environment::open(&network, &chosen.server, open).await;
+            if let Some(pool) = pool.upgrade() {
+                pool.note_opened(chosen, request, opened);
+            }
+        });
+    }
+
+    /// Puts the opened session among the idle ones, or notes why there is none.
+    fn note_opened(
+        &self,
+        chosen: Chosen,
+        request: SessionRequest,
+        opened: Result<Environment, EnvironmentFault>,
+    ) {
         let Chosen { begun, server, simulator, task } = chosen;
-        let opened = Environment::open(&self.network, &server, open).await;
         let mut state = self.state();
         let this = (begun, server.clone());
         if let Some(index) = state.opening.iter().position(|other| *other == this) {
@@ -280,8 +295,7 @@ impl SessionPool for ZenohPool {
                 return Ok(session);
             }
             if let Some(chosen) = pool.reserve(request, &fleet) {
-                let (pool, request) = (Arc::clone(pool), request.clone());
-                tokio::spawn(async move { pool.open(chosen, request).await });
+                pool.open(chosen, request.clone());
             }
             pool.check_patience(request, &fleet)?;
             // Sooner or later even where nothing changes: backoffs and patience end by the clock.

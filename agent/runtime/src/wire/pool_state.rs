@@ -17,6 +17,8 @@ pub const REFUSED_PAUSE: Duration = Duration::from_secs(1);
 const OPENING_USUAL: Duration = Duration::from_secs(5);
 /// The first time for which a server that did not answer is left out, doubled each time.
 pub const BACKOFF: Duration = Duration::from_secs(30);
+/// The longest such time.
+pub const BACKOFF_MAX: Duration = Duration::from_secs(600);
 
 /// What is known of a run's sessions.
 #[derive(Default)]

@@ -56,7 +56,7 @@ pub fn video_path(folder: &Path, id: &str) -> PathBuf {
     folder.join(VIDEOS).join(format!("{id}.mp4"))
 }
 
-/// Keeps the video of an episode. Written before its record, so that whoever finds the record finds the video.
+/// Keeps the video of an episode. It is written before the record, so that every record's video exists.
 pub fn write_video(folder: &Path, id: &str, video: &[u8]) -> Result<()> {
     let videos = folder.join(VIDEOS);
     std::fs::create_dir_all(&videos)
