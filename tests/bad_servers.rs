@@ -1,6 +1,7 @@
 //! Servers that do not keep to the protocol cost their own episodes and nobody else's, and are named as what they are.
 
 use std::collections::BTreeSet;
+use std::process::Output;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -224,4 +225,51 @@ async fn a_reply_that_precedes_its_request_is_refused() {
     let EnvironmentFault::Wire { reason } = &fault else { panic!("expected a fault, got {fault}") };
     assert!(reason.contains("to come before its reply"), "{reason}");
     router.close().await.expect("the router closes");
+}
+
+#[test]
+fn what_a_server_tells_wrongly_at_every_heartbeat_is_said_a_few_times() {
+    let (output, server) = evaluate_on("beats", "beats_wildly", &["--tasks=widowx_stack_cube"]);
+    let said = text(&output);
+    assert!(output.status.success(), "{said}");
+    let unreadable = format!("server {server}: heartbeat cannot be read");
+    assert_eq!(said.matches(&unreadable).count(), 1, "{said}");
+    // Once per doubling.
+    let growing = said.matches(&format!("server {server} holds")).count();
+    assert!((1..8).contains(&growing), "{said}");
+    assert!(!said.contains("ERROR"), "{said}");
+}
+
+#[test]
+fn a_task_that_no_server_offers_is_refused_and_leaves_no_run() {
+    let (output, _) = evaluate_on("unknown", "any_version", &["--tasks=nonsense"]);
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(said.contains("task: expected one of "), "{said}");
+    assert!(said.contains("got nonsense"), "{said}");
+    assert!(!said.contains("rerun"), "{said}");
+}
+
+/// Evaluates one episode on a server with a defect; what the program said, and the server's id.
+fn evaluate_on(fleet: &str, defect: &str, arguments: &[&str]) -> (Output, String) {
+    let endpoint = free_endpoint();
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    let router = runtime.block_on(open_router(&endpoint));
+    let server = Server::start_broken_behind_router(&endpoint, fleet, defect);
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut evaluate = rever();
+    evaluate.current_dir(folder.path()).arg("evaluate").args(arguments).args([
+        "--strategies=sample",
+        "--layouts=random",
+        "--episodes=1",
+        "--out=run",
+        "--labels=labels.sqlite",
+        &format!("--fleet={fleet}"),
+        &format!("--connect={endpoint}"),
+    ]);
+    let output = run(&mut evaluate);
+    let has_run = folder.path().join("run").exists();
+    assert_eq!(has_run, output.status.success(), "{}", text(&output));
+    runtime.block_on(async { router.close().await }).expect("the router closes");
+    (output, server.id.clone())
 }

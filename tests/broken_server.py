@@ -246,6 +246,19 @@ def ignore_unanswered() -> None:
         return original(self, key, answer)
 
 
+def beats_wildly() -> None:
+    """Every second heartbeat cannot be read; the others tell of more memory each time."""
+    sent, told = itertools.count(), itertools.count()
+    encode = protocol.HEARTBEAT.encode
+    protocol.HEARTBEAT.encode = (  # type: ignore[method-assign]
+        lambda message: b"nonsense" if next(sent) % 2 else encode(message)
+    )
+
+    @wrap(Server, "_heartbeat")
+    def heartbeat(original: Any, self: Any) -> Any:
+        return replace(original(self), resident_bytes=(1 + next(told)) * 6_000_000_000)
+
+
 DEFECTS = {
     function.__name__: function
     for function in (
@@ -273,6 +286,7 @@ DEFECTS = {
         never_steps,
         describes_nonsense,
         answers_ahead,
+        beats_wildly,
     )
 }
 

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use protocol::{Observation, Open, Opening, PROTOCOL_VERSION, Reply, Reset, Transition, decode};
 use runtime::fault::EnvironmentFault;
 use runtime::wire::{Environment, Network, NetworkOptions, Timing};
+use tokio::net::{TcpListener, TcpStream};
 
 use crate::harness::repository;
 use crate::relay::{Badness, Relay};
@@ -213,6 +214,33 @@ async fn a_link_that_comes_back_costs_no_episode() {
     let expected = undisturbed.step(&[0.0; 7]).await.expect("a step");
     assert!(after == expected, "no step is done twice or left out");
     router.close().await.expect("the router goes");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_link_to_a_listening_agent_that_stays_away_is_named() {
+    let endpoint = free_endpoint();
+    let options = NetworkOptions {
+        listen: vec![endpoint.clone()],
+        listen_here: false,
+        fleet: "cut".into(),
+        timing: Timing { link_max: Duration::from_secs(2), ..Timing::default() },
+        ..NetworkOptions::default()
+    };
+    let network = Network::open(options).await.expect("the network opens");
+    let cable = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
+    let plug = format!("tcp/{}", cable.local_addr().expect("a bound listener has an address"));
+    let carrying = tokio::spawn(async move {
+        let (mut near, _) = cable.accept().await?;
+        let mut far = TcpStream::connect(endpoint.trim_start_matches("tcp/")).await?;
+        tokio::io::copy_bidirectional(&mut near, &mut far).await
+    });
+    let server = Server::start_behind_router(&plug, "cut", &[]);
+    assert_eq!(network.servers(1, WAIT).await.servers.len(), 1, "the server is found");
+    let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
+    let mut episode = environment.reset(spoon()).await.expect("an episode");
+    carrying.abort();
+    let fault = episode.step(&[0.0; 7]).await.expect_err("nothing carries it");
+    assert_eq!(fault, EnvironmentFault::LinkLost { server: server.id.clone() });
 }
 
 #[tokio::test(flavor = "multi_thread")]

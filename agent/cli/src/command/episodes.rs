@@ -149,7 +149,7 @@ impl EpisodesArguments {
         let verifier = self.verifier(&folder, &digest)?;
         self.check(&request, verifier.as_deref())?;
         let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let (tasks, deployment) = self.tasks(request.layouts, &runtime, host)?;
+        let (tasks, mut deployment) = self.tasks(request.layouts, &runtime, host)?;
         let suite = Suite {
             tasks,
             episodes: request.episodes,
@@ -160,8 +160,21 @@ impl EpisodesArguments {
         let plans = suite.episodes().map_err(|error| WrongUsage(error.to_string()))?;
         let options = self.options(&suite, &request.settings);
         let versions = build_info::versions(&digest, verifier.as_deref().map(Verifier::digest));
-        let run = self.open_run(request.title, options, versions)?;
-        let run_folder = run.folder.clone();
+        let run_folder = self.run_folder(request.title, &options, &versions);
+        if deployment.is_none() && !run_folder.exists() {
+            // Refused here, a task that nobody offers leaves no run behind.
+            let servers = self.open_servers(&runtime, host)?;
+            runtime.block_on(experiment::offered_tasks(&servers, &self.tasks))?;
+            deployment = Some(servers);
+        }
+        let run = Run::open(&RunRequest {
+            folder: run_folder.clone(),
+            labels: Some(self.labels.clone()),
+            options,
+            versions,
+            command: build_info::command_line(),
+            build: build_info::build(),
+        })?;
         let experiment = Experiment {
             title: request.title.to_owned(),
             plans,
@@ -175,7 +188,7 @@ impl EpisodesArguments {
         };
         let ending = experiment.run(run, &runtime, || match deployment {
             Some(deployment) => Ok(deployment),
-            None => self.servers(host)?.open(&runtime, usize::from(self.sessions)),
+            None => self.open_servers(&runtime, host),
         })?;
         let (results, provenance) = results(&run_folder)?;
         Ok(Outcome { folder: run_folder, policy: folder, results, provenance, ending })
@@ -214,7 +227,7 @@ impl EpisodesArguments {
             let unasked = |id: &TaskId| OfferedTask { id: id.clone(), layouts: 0 };
             return Ok((self.tasks.iter().map(unasked).collect(), None));
         }
-        let deployment = self.servers(host)?.open(runtime, usize::from(self.sessions))?;
+        let deployment = self.open_servers(runtime, host)?;
         let tasks = match &self.tasks[..] {
             [] => runtime.block_on(experiment::default_tasks(&deployment))?,
             wanted => runtime.block_on(experiment::offered_tasks(&deployment, wanted))?,
@@ -241,20 +254,16 @@ impl EpisodesArguments {
     }
 
     /// The named run's folder, or one that is named after what decides its results.
-    fn open_run(&self, title: &str, options: Value, versions: Value) -> Result<Run> {
-        let folder = self.out.clone().unwrap_or_else(|| {
+    fn run_folder(&self, title: &str, options: &Value, versions: &Value) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| {
             let digest = Sha256::digest(format!("{options}{versions}"));
             let short: String = digest.iter().take(4).map(|byte| format!("{byte:02x}")).collect();
             Path::new("runs").join(format!("{title}-{short}"))
-        });
-        Run::open(&RunRequest {
-            folder,
-            labels: Some(self.labels.clone()),
-            options,
-            versions,
-            command: build_info::command_line(),
-            build: build_info::build(),
         })
+    }
+
+    fn open_servers(&self, runtime: &Runtime, host: &Host) -> Result<Deployment> {
+        self.servers(host)?.open(runtime, usize::from(self.sessions))
     }
 
     /// Where the servers come from.

@@ -203,7 +203,7 @@ impl Discovery {
         let Some(server) = keys.server_of(sample.key_expr().as_str()) else { return };
         let bytes = sample.payload().len();
         let heartbeat = if bytes > Heartbeat::BYTES_MAX {
-            Err(format!("expected at most {} bytes, got {bytes}", Heartbeat::BYTES_MAX))
+            Err(format!("heartbeat: expected at most {} bytes, got {bytes}", Heartbeat::BYTES_MAX))
         } else {
             decode::<Heartbeat>(&sample.payload().to_bytes()).map_err(|error| error.to_string())
         };
@@ -224,7 +224,7 @@ impl Discovery {
         let mut known = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         let known = known.entry(server.to_owned()).or_default();
         if !std::mem::replace(&mut known.is_unreadable_reported, true) {
-            tracing::warn!("server {server}: its heartbeats cannot be read: {reason}");
+            tracing::warn!("server {server}: {reason}");
         }
     }
 

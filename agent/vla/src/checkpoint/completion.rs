@@ -1,16 +1,14 @@
 //! Completions read back: the text of tokens, candidates' reasoning and action, confidence. Needs no weights.
 
-use std::fs::File;
 use std::path::Path;
 
 use anyhow::{Context, Result};
 use decision::{ActionSpace, Malformed, Parsed};
-use sha2::{Digest, Sha256};
 
 use super::actions::ActionBins;
 use super::config::{ACTION_LENGTH, Config};
+use super::identity::identity;
 use super::prompt::Prompter;
-use super::weights::weight_files;
 use super::{confidence, parse};
 
 /// What a checkpoint's configuration and tokenizer say about its completions.
@@ -22,20 +20,20 @@ pub struct CompletionParser {
 }
 
 impl CompletionParser {
-    /// Reads config.json and tokenizer.json of a checkpoint's folder, and the digest of all its files.
+    /// Reads config.json and tokenizer.json of a checkpoint's folder, and the checkpoint's identity.
     pub fn load(directory: &Path) -> Result<CompletionParser> {
         let load = || -> Result<CompletionParser> {
             let config = Config::load(&directory.join("config.json"))?;
             let prompter = Prompter::load(&directory.join("tokenizer.json"), &config)?;
             let scale = config.action_scale.clone();
             let bins = ActionBins::new(config.vocabulary, config.action_bins, scale);
-            let digest = digest(directory)?;
+            let digest = identity(directory, &config)?;
             Ok(CompletionParser { config, prompter, bins, digest })
         };
         load().with_context(|| format!("cannot load the policy in {}", directory.display()))
     }
 
-    /// SHA-256 of weights, config and tokenizer, in hexadecimal.
+    /// The checkpoint's identity: SHA-256 of what it computes, in hexadecimal.
     pub fn digest(&self) -> &str {
         &self.digest
     }
@@ -64,20 +62,4 @@ impl CompletionParser {
     pub fn confidence(&self, tokens: &[u32], log_probabilities: &[f32]) -> Vec<f32> {
         confidence::confidence(tokens, log_probabilities, &self.bins, &self.prompter)
     }
-}
-
-/// Of all files in turn, each after its length; read as a stream, for weights may be larger than the memory.
-fn digest(directory: &Path) -> Result<String> {
-    let mut hasher = Sha256::new();
-    let mut files = vec![directory.join("config.json"), directory.join("tokenizer.json")];
-    files.extend(weight_files(directory)?);
-    for path in files {
-        let mut read = || -> std::io::Result<()> {
-            let mut file = File::open(&path)?;
-            hasher.update(file.metadata()?.len().to_le_bytes());
-            std::io::copy(&mut file, &mut hasher).map(drop)
-        };
-        read().with_context(|| format!("cannot read {}", path.display()))?;
-    }
-    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }

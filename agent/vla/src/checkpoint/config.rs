@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::network::rotary::HeadShape;
 
@@ -18,8 +18,8 @@ const VICUNA_PROMPT: &str = "A chat between a curious user and an artificial int
     assistant. The assistant gives helpful, detailed, and polite answers to the user's questions. \
     USER: What action should the robot take to {instruction}? ASSISTANT: TASK:";
 
-/// What the network and its inputs and outputs look like.
-#[derive(Debug, Clone)]
+/// What the network and its inputs and outputs look like; as JSON, part of the checkpoint's identity.
+#[derive(Debug, Clone, Serialize)]
 pub struct Config {
     /// The first is DINO-like when there are two.
     pub towers: Vec<TowerConfig>,
@@ -36,7 +36,7 @@ pub struct Config {
 }
 
 /// One vision transformer in timm's terms.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct TowerConfig {
     pub image_size: usize,
@@ -51,7 +51,7 @@ pub struct TowerConfig {
 }
 
 /// The Llama decoder; what `text_config` leaves out has Hugging Face's defaults.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Deserialize, Serialize)]
 #[serde(default)]
 pub struct TextConfig {
     pub model_type: String,
@@ -96,7 +96,7 @@ impl Default for TextConfig {
 }
 
 /// How normalised actions become physical: the 1st and 99th percentile of the training data.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Deserialize, Serialize)]
 pub struct ActionScale {
     pub q01: [f64; ACTION_LENGTH],
     pub q99: [f64; ACTION_LENGTH],
@@ -184,7 +184,10 @@ impl Config {
             prompt_template: file.prompt_template()?,
             reasoning: file.reasoning,
             completion_tokens_max: file.max_new_tokens.unwrap_or(limit),
-            text: file.text_config,
+            text: TextConfig {
+                num_key_value_heads: Some(file.text_config.key_value_heads()),
+                ..file.text_config
+            },
         })
     }
 }

@@ -4,6 +4,7 @@ pub mod actions;
 pub mod completion;
 pub mod confidence;
 pub mod config;
+pub mod identity;
 pub mod parse;
 pub mod prompt;
 pub mod weights;

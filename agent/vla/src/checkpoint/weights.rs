@@ -77,8 +77,8 @@ pub fn weight_files(directory: &Path) -> Result<Vec<PathBuf>> {
     Ok(names.into_iter().map(|name| directory.join(name)).collect())
 }
 
-/// `towers` are names of vision towers with the number of blocks that are run.
-fn is_dead(name: &str, towers: &[(&str, usize)]) -> bool {
+/// Whether no output depends on a tensor; `towers` are names of vision towers with the number of blocks that are run.
+pub fn is_dead(name: &str, towers: &[(&str, usize)]) -> bool {
     towers.iter().any(|(tower, blocks_used)| {
         let Some(rest) = name.strip_prefix(tower).and_then(|rest| rest.strip_prefix('.')) else {
             return false;

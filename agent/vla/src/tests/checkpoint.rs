@@ -42,16 +42,111 @@ fn dead_weights_are_counted() -> Result<()> {
     Ok(())
 }
 
+fn identity(policy: Result<Vla>) -> Result<String> {
+    Ok(policy?.parser().digest().to_owned())
+}
+
+fn halve(tensors: &mut HashMap<String, Tensor>) -> Result<()> {
+    for tensor in tensors.values_mut() {
+        *tensor = tensor.to_dtype(DType::BF16)?;
+    }
+    Ok(())
+}
+
 #[test]
 fn sixteen_bit_weights_load() -> Result<()> {
-    let halve = |tensors: &mut HashMap<String, Tensor>| -> Result<()> {
+    let policy = load_changed("tiny", halve, |_| {});
+    assert_ne!(identity(policy)?, identity(tiny("tiny", Backend::Kernels))?);
+    Ok(())
+}
+
+#[test]
+fn the_identity_does_not_depend_on_how_files_are_written() -> Result<()> {
+    let expected = identity(tiny("tiny", Backend::Kernels))?;
+    let unread = |config: &mut serde_json::Value| {
+        config["transformers_version"] = "4.40.1".into();
+        let statistics = config["norm_stats"].as_object().and_then(|all| all.values().next());
+        let mut other = statistics.expect("a dataset").clone();
+        other["action"]["q01"][0] = (-7.5).into();
+        let only = config["norm_stats"].as_object().and_then(|all| all.keys().next());
+        config["unnorm_key"] = only.expect("a dataset").clone().into();
+        config["norm_stats"]["another_dataset"] = other;
+    };
+    assert_eq!(identity(load_changed("tiny", |_| Ok(()), unread))?, expected, "fields not read");
+
+    let wide = |tensors: &mut HashMap<String, Tensor>| -> Result<()> {
+        halve(tensors)?;
         for tensor in tensors.values_mut() {
-            *tensor = tensor.to_dtype(DType::BF16)?;
+            *tensor = tensor.to_dtype(DType::F32)?;
         }
         Ok(())
     };
-    let policy = load_changed("tiny", halve, |_| {})?;
-    assert_ne!(policy.parser().digest(), tiny("tiny", Backend::Kernels)?.parser().digest());
+    let halved = identity(load_changed("tiny", halve, |_| {}))?;
+    assert_eq!(identity(load_changed("tiny", wide, |_| {}))?, halved, "the same values, wider");
+
+    let directory = tempfile::tempdir()?;
+    let source = fixtures().join("tiny");
+    std::fs::copy(source.join("config.json"), directory.path().join("config.json"))?;
+    let tokenizer: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(source.join("tokenizer.json"))?)?;
+    let indented = serde_json::to_string_pretty(&tokenizer)?;
+    std::fs::write(directory.path().join("tokenizer.json"), indented)?;
+    let tensors = candle_core::safetensors::load(source.join("model.safetensors"), &Device::Cpu)?;
+    let mut weight_map = HashMap::new();
+    let mut shards = [HashMap::new(), HashMap::new()];
+    for (name, tensor) in tensors {
+        let shard = name.len() % 2;
+        weight_map.insert(name.clone(), format!("{shard}.safetensors"));
+        shards[shard].insert(name, tensor);
+    }
+    for (index, shard) in shards.iter().enumerate() {
+        candle_core::safetensors::save(
+            shard,
+            directory.path().join(format!("{index}.safetensors")),
+        )?;
+    }
+    let index = serde_json::json!({ "weight_map": weight_map });
+    std::fs::write(directory.path().join("model.safetensors.index.json"), index.to_string())?;
+    let sharded = identity(Vla::load(directory.path(), DeviceName::Cpu))?;
+    assert_eq!(sharded, expected, "shards, indentation");
+    Ok(())
+}
+
+#[test]
+fn what_computes_differently_has_another_identity() -> Result<()> {
+    let expected = identity(tiny("tiny", Backend::Kernels))?;
+    let one_weight = |tensors: &mut HashMap<String, Tensor>| -> Result<()> {
+        let bias = tensors.get_mut("projector.fc2.bias").expect("a bias");
+        *bias = (bias.clone() + 1e-3)?;
+        Ok(())
+    };
+    assert_ne!(identity(load_changed("tiny", one_weight, |_| {}))?, expected);
+    let changes: [fn(&mut serde_json::Value); 4] = [
+        |config| config["prompt_template"] = "{instruction}".into(),
+        |config| config["max_new_tokens"] = 17.into(),
+        |config| config["text_config"]["rope_theta"] = 9999.0.into(),
+        |config| {
+            let datasets = config["norm_stats"].as_object_mut().expect("datasets");
+            for dataset in datasets.values_mut() {
+                dataset["action"]["q99"][0] = 7.5.into();
+            }
+        },
+    ];
+    for (index, change) in changes.into_iter().enumerate() {
+        assert_ne!(identity(load_changed("tiny", |_| Ok(()), change))?, expected, "{index}");
+    }
+    Ok(())
+}
+
+#[test]
+fn weights_that_no_output_depends_on_are_not_part_of_the_identity() -> Result<()> {
+    let dead = |tensors: &mut HashMap<String, Tensor>| -> Result<()> {
+        let norm = tensors.get_mut("vision_backbone.featurizer.norm.bias").expect("a dead weight");
+        *norm = (norm.clone() + 1.0)?;
+        Ok(())
+    };
+    let expected = identity(tiny("tiny-fused", Backend::Kernels))?;
+    assert_eq!(identity(load_changed("tiny-fused", dead, |_| {}))?, expected);
     Ok(())
 }
 
