@@ -31,6 +31,9 @@ mod simulators;
 mod installation;
 mod local_servers;
 
+// The command line: wrong usage, help, lists, Ctrl-C.
+mod command_line;
+
 // Evaluations with the models that come with the program: results, kills, faults, the report.
 mod whole_loop;
 

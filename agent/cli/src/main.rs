@@ -14,7 +14,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use command::Program;
-use runtime::experiment::UnknownTask;
+use runtime::experiment::Stopped;
 use runtime::servers::Host;
 
 fn main() -> ExitCode {
@@ -22,15 +22,25 @@ fn main() -> ExitCode {
     // Wrong usage ends inside `parse`, with status 2 and a message that says what was expected.
     let program = Program::parse();
     #[expect(clippy::disallowed_methods, reason = "this is main")]
-    let filter = std::env::var("REVER_LOG").ok();
-    command::start_log(filter.as_deref());
+    let variable = |name| std::env::var(name).ok().filter(|value| !value.is_empty());
+    program.start_log(variable("REVER_LOG").as_deref(), variable("NO_COLOR").is_none());
     match program.run(&host()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            let is_usage = error.is::<command::WrongUsage>() || error.is::<UnknownTask>();
-            ExitCode::from(if is_usage { 2 } else { 1 })
+            ExitCode::from(status_of(&error))
         }
+    }
+}
+
+/// As a shell sees a command: 2 for wrong usage, 130 for one that was stopped with Ctrl-C, 1 for anything else.
+fn status_of(error: &anyhow::Error) -> u8 {
+    if error.is::<command::WrongUsage>() {
+        2
+    } else if error.is::<Stopped>() {
+        130
+    } else {
+        1
     }
 }
 

@@ -82,6 +82,29 @@ impl Rate {
     }
 }
 
+impl Gain {
+    /// Whether the interval leaves only one sign.
+    pub fn is_clear(&self) -> bool {
+        !self.interval.contains(0.0)
+    }
+
+    /// About how many pairs would make a gain of this size clear with 80 % power; none where it is clear, or where nothing
+    /// was gained or lost. An interval's width falls with the root of the pairs.
+    pub fn pairs_to_tell(&self) -> Option<u64> {
+        // Normal quantiles of 97.5 % and 80 %.
+        const RATIO: f64 = (1.96 + 0.84) / 1.96;
+        let half_width = (self.interval.high - self.interval.low) / 2.0;
+        let needed = self.pairs as f64 * (RATIO * half_width / self.mean).powi(2);
+        let is_known = !self.is_clear() && needed.is_finite() && needed < PAIRS_TOLD_MAX;
+        // Two digits: the estimate is no better than that.
+        let unit = 10_f64.powf((needed.log10().floor() - 1.0).max(0.0));
+        is_known.then(|| ((needed / unit).ceil() * unit) as u64)
+    }
+}
+
+/// More pairs than anybody runs.
+const PAIRS_TOLD_MAX: f64 = 1e5;
+
 /// The gain of `better` over `worse`, which hold the same starts; none when a task has none.
 pub fn gain(better: &[TaskClusters], worse: &[TaskClusters]) -> Option<Gain> {
     let (one, other) = (average(better)?, average(worse)?);

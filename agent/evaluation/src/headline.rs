@@ -36,10 +36,13 @@ impl Headline {
 
 fn compared(main: &SettingGain) -> Headline {
     let gain = &main.gain;
-    let verdict = match (gain.interval.low > 0.0, gain.interval.high < 0.0) {
-        (true, _) => "The verifier is better.",
-        (_, true) => "The verifier is worse.",
-        _ => "Not clear yet: the interval includes 0.",
+    let verdict = match (gain.interval.low > 0.0, gain.interval.high < 0.0, gain.pairs_to_tell()) {
+        (true, _, _) => "The verifier is better.".to_owned(),
+        (_, true, _) => "The verifier is worse.".to_owned(),
+        (_, _, Some(pairs)) => format!(
+            "Not clear yet: the interval includes 0. If the gain is of this size, about {pairs} pairs tell (80 % power)."
+        ),
+        (_, _, None) => "Not clear yet: the interval includes 0.".to_owned(),
     };
     let Setting { candidates, temperature, .. } = main.better;
     Headline {

@@ -22,3 +22,4 @@ pub mod headline;
 pub mod report;
 pub mod result_file;
 pub mod table;
+pub mod task_names;

@@ -216,7 +216,8 @@ fn count(episodes: &TaskEpisodes<'_>, faults: &[&FaultRecord]) -> Counts {
 }
 
 impl Counts {
-    fn plus(self, other: Counts) -> Counts {
+    /// Both together.
+    pub fn plus(self, other: Counts) -> Counts {
         Counts {
             faults: self.faults + other.faults,
             never_acted: self.never_acted + other.never_acted,

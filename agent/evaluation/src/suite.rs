@@ -47,7 +47,7 @@ impl Suite {
     }
 
     fn episode(&self, task: &OfferedTask, episode: u32) -> anyhow::Result<EpisodePlan> {
-        let OfferedTask { id: task, layouts } = task;
+        let OfferedTask { id: task, layouts, .. } = task;
         let layout = match self.layouts {
             Layouts::Random => None,
             Layouts::Grid => Some(episode.checked_rem(*layouts).with_context(|| {
@@ -89,8 +89,9 @@ mod tests {
     ];
 
     fn suite(layouts: Layouts, seed: u64) -> Suite {
-        let tasks =
-            TASKS.map(|task| OfferedTask { id: TaskId::default_of(task), layouts: 24 }).to_vec();
+        let tasks = TASKS
+            .map(|task| OfferedTask { id: TaskId::default_of(task), layouts: 24, steps_max: 60 })
+            .to_vec();
         Suite { tasks, episodes: 30, layouts, range: SeedRange::Evaluation, seed }
     }
 

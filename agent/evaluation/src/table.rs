@@ -1,201 +1,145 @@
-//! The tables that a terminal shows, each with a sentence that says what to see in it.
+//! What a terminal shows of a run: the answer first, then the rates and gains behind it. Everything else is in [`details`].
+
+pub mod details;
 
 use comfy_table::{CellAlignment, Table, presets};
-use decision::Strategy;
+use decision::{Setting, Strategy};
 
+use crate::comparisons::SettingGain;
 use crate::estimate::Rate;
 use crate::headline::Headline;
-use crate::results::{Counts, Results, SettingResult, StepTime};
+use crate::results::{Counts, Results, SettingResult};
 use crate::statistics::Interval;
+use crate::task_names::short_names;
 
-/// The headline and all tables, one after the other. Every percentage has its interval or its number of episodes.
-pub fn text(results: &Results) -> String {
+/// Columns of a terminal that tells no other number, and at most.
+pub const COLUMNS_DEFAULT: usize = 80;
+
+/// The answer: at most `columns` wide where that is possible at all.
+pub fn answer(results: &Results, columns: usize) -> String {
     let headline =
-        Headline::new(results).map_or_else(String::new, |one| one.text().trim().to_owned() + "\n");
-    let parts = [
-        headline,
-        averages(results),
-        tasks(results),
-        gains(results),
-        headroom(results),
-        by_candidates(results),
-        counts(results),
-        times(results),
-    ];
+        Headline::new(results).map_or_else(String::new, |one| wrapped(&one.text(), columns));
+    let parts = [headline, rates(results, columns), gains(results), remarks(results)];
     parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
 }
 
-/// A title, the table below it, and what to see in it; nothing without rows.
-fn titled(title: &str, head: &[&str], rows: Vec<Vec<String>>, note: &str) -> String {
-    if rows.is_empty() {
-        return String::new();
+/// Success of every setting, on all tasks together and on each.
+fn rates(results: &Results, columns: usize) -> String {
+    let names = short_names(&results.tasks);
+    let episodes = common(results.settings.iter().map(|one| episodes(one.all.success)));
+    let mut head = vec![String::new(), "all tasks".to_owned()];
+    head.extend(names.iter().cloned());
+    if episodes.is_none() {
+        head.push("episodes".to_owned());
     }
-    let head = head.iter().map(|name| (*name).to_owned()).collect();
-    let rows: Vec<Vec<String>> = std::iter::once(head).chain(rows).collect();
-    let note = if note.is_empty() { String::new() } else { format!("{note}\n") };
-    format!("{title}\n{}{note}", aligned(&rows))
-}
-
-fn averages(results: &Results) -> String {
     let row = |result: &SettingResult| {
-        vec![
-            format!("  {}", result.setting),
-            with_interval(result.all.success),
-            percent(result.all.ever_success),
-            percent(result.all.released_success),
-            percent(result.all.grasped),
-            episodes(result.all.success),
-        ]
-    };
-    let clustered =
-        results.settings.iter().any(|one| one.all.success.episodes > one.all.success.starts);
-    let note = match clustered {
-        true => {
-            "  Episodes that share an initial layout are a cluster: the interval is as wide as that makes it."
+        let mut row = vec![format!("  {}", result.setting), with_interval(result.all.success)];
+        row.extend(result.tasks.iter().map(|task| whole_percent(task.success)));
+        if episodes.is_none() {
+            row.push(self::episodes(result.all.success));
         }
-        false => "",
+        row
     };
-    titled(
-        "Success in % of episodes, averaged over tasks, each of which counts the same; 95 % intervals",
-        &["", "at the last step", "at any step", "released", "ever grasped", "episodes"],
-        results.settings.iter().map(row).collect(),
-        note,
-    )
+    let mut rows: Vec<Vec<String>> =
+        std::iter::once(head).chain(results.settings.iter().map(row)).collect();
+    if results.tasks.len() < 2 || aligned(&rows).lines().any(|line| line.chars().count() > columns)
+    {
+        rows.iter_mut().for_each(|row| drop(row.drain(2..2 + names.len())));
+    }
+    let each = episodes.map_or_else(String::new, |count| format!(", n = {count} each"));
+    format!("Success at the last step in %, 95 % intervals{each}\n{}", aligned(&rows))
 }
 
-fn tasks(results: &Results) -> String {
-    if results.tasks.len() < 2 {
-        return String::new();
-    }
-    let mut rows = Vec::new();
-    for (index, task) in results.tasks.iter().enumerate() {
-        rows.push(vec![format!("  {task}")]);
-        for result in &results.settings {
-            let of_task = &result.tasks[index];
-            rows.push(vec![
-                format!("    {}", result.setting),
-                with_interval(of_task.success),
-                percent(of_task.released_success),
-                percent(of_task.grasped),
-                malformed(of_task.counts),
-                episodes(of_task.success),
-            ]);
-        }
-    }
-    titled(
-        "Success per task in % of episodes, and malformed candidates in % of all",
-        &["", "at the last step", "released", "ever grasped", "malformed", "episodes"],
-        rows,
-        "",
-    )
-}
-
+/// Paired gains, with the verdict for which they are made.
 fn gains(results: &Results) -> String {
-    let rows = results.gains.iter().map(|one| {
-        let gain = &one.gain;
-        vec![
-            format!("  {} minus {}", one.better, one.worse),
-            format!("{:+.1}", 100.0 * gain.mean),
-            signed(gain.interval),
-            gain.pairs.to_string(),
-        ]
-    });
-    titled(
-        "Gains in percentage points, on the same initial layouts with the same random numbers",
-        &["", "gain", "95 %", "pairs"],
-        rows.collect(),
-        "  An interval that includes 0 leaves open which of the two is better.",
-    )
-}
-
-fn headroom(results: &Results) -> String {
-    let rows = results.headroom.iter().map(|one| {
-        let headroom = &one.headroom;
-        vec![
-            format!("  {}", one.setting),
-            format!("{:.0} %", 100.0 * headroom.fraction),
-            headroom.interval.map_or_else(|| "open".to_owned(), rounded),
-            headroom.episodes.to_string(),
-        ]
-    });
-    titled(
-        "Headroom: share of the gap between a single sample and the oracle that a setting closes",
-        &["", "share", "95 %", "episodes"],
-        rows.collect(),
-        "  The oracle executes the candidate nearest to the scripted expert's action.\n  Open: the oracle may be no \
-         better than a single sample.",
-    )
-}
-
-/// Where a strategy ran with several numbers of candidates; a single sample is its first point.
-fn by_candidates(results: &Results) -> String {
-    let mut rows = Vec::new();
-    for strategy in Strategy::ALL {
-        let of_strategy = |result: &&SettingResult| result.setting.strategy == strategy;
-        let mut temperatures: Vec<f32> = results
-            .settings
-            .iter()
-            .filter(of_strategy)
-            .map(|result| result.setting.temperature)
-            .collect();
-        temperatures.dedup();
-        for temperature in temperatures {
-            let is_point = |result: &&SettingResult| {
-                result.setting.temperature == temperature
-                    && [strategy, Strategy::Sample].contains(&result.setting.strategy)
-            };
-            let points: Vec<&SettingResult> = results.settings.iter().filter(is_point).collect();
-            if points.iter().filter(|result| of_strategy(result)).count() < 2 {
-                continue;
-            }
-            rows.extend(points.into_iter().map(|point| {
-                vec![
-                    format!("  {strategy} T={temperature}"),
-                    point.setting.candidates.to_string(),
-                    with_interval(point.all.success),
-                ]
-            }));
-        }
+    if results.gains.is_empty() {
+        return String::new();
     }
-    titled("Success against the number of candidates N", &["", "N", "at the last step"], rows, "")
-}
-
-fn counts(results: &Results) -> String {
-    let row = |result: &SettingResult| {
-        let Counts { faults, never_acted, repeats, proposed, malformed, decisions, held_steps } =
-            result.all.counts;
+    let row = |one: &SettingGain| {
+        let SettingGain { better, worse, gain } = one;
+        let verdict = match gain.is_clear() {
+            true => String::new(),
+            false => "not clear".to_owned(),
+        };
         vec![
-            format!("  {}", result.setting),
-            format!("{malformed} of {proposed}"),
-            format!("{held_steps} of {decisions}"),
-            never_acted.to_string(),
-            faults.to_string(),
-            repeats.to_string(),
+            format!("  {} - {}", better, within(*worse, *better)),
+            format!("{:+.1} {}", 100.0 * gain.mean, signed(gain.interval)),
+            gain.pairs.to_string(),
+            verdict,
         ]
     };
-    titled(
-        "Beside the rates",
-        &["", "malformed candidates", "held steps", "never acted", "faults", "repeats"],
-        results.settings.iter().map(row).collect(),
-        "  Malformed candidates are never executed; without a well-formed one the robot holds still.\n  Episodes in which \
-         the policy never acted and attempts that broke (faults) have no outcome.\n  Repeats of an episode in which \
-         nothing is drawn count once.",
-    )
+    let head = ["", "gain [95 % interval]", "pairs", ""].map(str::to_owned).to_vec();
+    let rows: Vec<Vec<String>> =
+        std::iter::once(head).chain(results.gains.iter().map(row)).collect();
+    let table = aligned(&rows);
+    let table: String = table.lines().map(|line| format!("{}\n", line.trim_end())).collect();
+    format!("Gains in percentage points, on the same initial layouts\n{table}")
 }
 
-fn times(results: &Results) -> String {
-    let batch =
-        results.batch_size.map_or_else(String::new, |size| format!(" (batches of {size:.0})"));
-    let times = [
-        (format!("  decision{batch}"), results.decision_ms),
-        ("  control step after it".to_owned(), results.step_ms),
-        ("    of that, the simulator".to_owned(), results.simulator_ms),
-    ];
-    let rows = times.into_iter().filter_map(|(what, time)| {
-        let StepTime { p50, p95 } = time?;
-        Some(vec![what, format!("{p50:.1}"), format!("{p95:.1}")])
-    });
-    titled("Milliseconds", &["", "median", "p95"], rows.collect(), "")
+/// A setting beside another, without what both share.
+fn within(setting: Setting, beside: Setting) -> String {
+    let Setting { strategy, candidates, temperature } = setting;
+    let mut text = strategy.to_string();
+    let proposes_one = matches!(strategy, Strategy::Greedy | Strategy::Sample);
+    if candidates != beside.candidates && !proposes_one {
+        text.push_str(&format!(" N={candidates}"));
+    }
+    if temperature != beside.temperature && strategy != Strategy::Greedy {
+        text.push_str(&format!(" T={temperature}"));
+    }
+    text
+}
+
+/// What must be known beside the rates: only what there is.
+fn remarks(results: &Results) -> String {
+    let Counts { faults, never_acted, proposed, malformed, decisions, held_steps, .. } =
+        results.settings.iter().map(|one| one.all.counts).fold(Counts::default(), Counts::plus);
+    let mut lines = Vec::new();
+    if faults > 0 {
+        lines.push(format!(
+            "Faults: {faults} attempts broke and were retried; they are in no rate."
+        ));
+    }
+    if never_acted > 0 {
+        lines.push(format!(
+            "In {never_acted} episodes every decision was held (no well-formed candidate): no outcome."
+        ));
+    }
+    if malformed > 0 {
+        lines.push(format!(
+            "Malformed candidates: {} of {proposed}; the robot held still in {held_steps} of {decisions} steps.",
+            malformed
+        ));
+    }
+    if results.settings.iter().any(|one| one.setting.strategy == Strategy::Sample) {
+        lines.push(
+            "sample: a single candidate (N = 1). verifier N=5: the best of five by score."
+                .to_owned(),
+        );
+    }
+    lines.iter().map(|line| format!("{line}\n")).collect()
+}
+
+/// What all say, if they say the same.
+fn common(texts: impl Iterator<Item = String>) -> Option<String> {
+    let mut texts: Vec<String> = texts.collect();
+    texts.dedup();
+    (texts.len() == 1).then(|| texts.remove(0))
+}
+
+/// Lines of at most so many columns, broken between words.
+pub fn wrapped(text: &str, columns: usize) -> String {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= columns => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines.iter().map(|line| format!("{line}\n")).collect()
 }
 
 /// How many episodes a rate is over, and over how many initial layouts where these are fewer.
@@ -210,11 +154,8 @@ fn percent(rate: Rate) -> String {
     rate.value.map_or_else(|| "-".to_owned(), |value| format!("{:.1}", 100.0 * value))
 }
 
-fn malformed(counts: Counts) -> String {
-    match counts.proposed {
-        0 => "-".to_owned(),
-        proposed => format!("{:.1}", 100.0 * counts.malformed as f64 / proposed as f64),
-    }
+fn whole_percent(rate: Rate) -> String {
+    rate.value.map_or_else(|| "-".to_owned(), |value| format!("{:.0}", 100.0 * value))
 }
 
 fn with_interval(rate: Rate) -> String {
@@ -226,22 +167,23 @@ fn signed(interval: Interval) -> String {
     format!("[{:+.1}, {:+.1}]", 100.0 * interval.low, 100.0 * interval.high)
 }
 
-fn rounded(interval: Interval) -> String {
-    format!("[{:.0}, {:.0}]", 100.0 * interval.low, 100.0 * interval.high)
+/// Columns of numbers: the first column to the left, the others to the right.
+pub fn aligned(rows: &[Vec<String>]) -> String {
+    aligned_to(rows, CellAlignment::Right)
 }
 
-/// The first column to the left, the others to the right.
-pub fn aligned(rows: &[Vec<String>]) -> String {
+/// Columns of text.
+pub fn aligned_left(rows: &[Vec<String>]) -> String {
+    aligned_to(rows, CellAlignment::Left)
+}
+
+fn aligned_to(rows: &[Vec<String>], others: CellAlignment) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).add_rows(rows);
     for (index, column) in table.column_iter_mut().enumerate() {
         // Two spaces between columns, none before the first.
         column.set_padding((if index == 0 { 0 } else { 2 }, 0));
-        column.set_cell_alignment(if index == 0 {
-            CellAlignment::Left
-        } else {
-            CellAlignment::Right
-        });
+        column.set_cell_alignment(if index == 0 { CellAlignment::Left } else { others });
     }
     table.trim_fmt() + "\n"
 }

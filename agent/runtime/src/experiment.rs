@@ -54,6 +54,8 @@ pub struct Experiment {
     pub record: RecordOptions,
     /// What records say they were made with.
     pub versions: Versions,
+    /// Whether to show neither where the run stands nor its progress.
+    pub is_quiet: bool,
 }
 
 /// What became of an experiment.
@@ -75,16 +77,22 @@ impl Ending {
         if self.missing == 0 {
             return Ok(());
         }
-        let why = if self.was_stopped { "stopped" } else { "faults" };
+        let (missing, planned, folder) = (self.missing, self.planned, folder.display());
+        let text = format!(
+            "{missing} of {planned} episodes incomplete; rerun the same command to resume {folder}"
+        );
+        if self.was_stopped {
+            bail!(Stopped(text));
+        }
         let given_up: String = self.given_up.iter().map(|one| format!("\n{one}")).collect();
-        bail!(
-            "{why}: {} of {} episodes incomplete; rerun the same command to resume {}{given_up}",
-            self.missing,
-            self.planned,
-            folder.display()
-        )
+        bail!("faults: {text}{given_up}")
     }
 }
+
+/// Somebody stopped the run before it was complete.
+#[derive(Debug, Error)]
+#[error("stopped: {0}")]
+pub struct Stopped(String);
 
 impl Experiment {
     /// Runs what is not recorded yet in `run`, on servers that are only started where something is missing. Blocks.
@@ -100,7 +108,9 @@ impl Experiment {
         let queue = RunQueue::new(&name, &self.plans, &self.settings, &recorded);
         let queue = Arc::new(queue);
         let mut was_stopped = false;
-        if runtime.block_on(queue.progress())?.waiting > 0 {
+        let waiting = runtime.block_on(queue.progress())?.waiting;
+        self.announce(&folder, waiting);
+        if waiting > 0 {
             let deployment = deploy()?;
             let result = runtime.block_on(self.roll_out(&deployment, run, Arc::clone(&queue)));
             let closed = deployment.close(runtime);
@@ -117,6 +127,22 @@ impl Experiment {
         Ok(Ending { missing, planned, given_up, was_stopped })
     }
 
+    /// Says which run this is, and what of it there is already.
+    fn announce(&self, folder: &Path, waiting: usize) {
+        if self.is_quiet {
+            return;
+        }
+        let planned = self.plans.len() * self.settings.len();
+        let (folder, recorded) = (folder.display(), planned.saturating_sub(waiting));
+        match (recorded, waiting) {
+            (_, 0) => {
+                eprintln!("run {folder}: all {planned} episodes are recorded, nothing to run")
+            }
+            (0, _) => eprintln!("run {folder}: {planned} episodes"),
+            _ => eprintln!("run {folder}: resuming, {recorded} of {planned} episodes are recorded"),
+        }
+    }
+
     fn check(&self) -> Result<()> {
         ensure!(!self.settings.is_empty(), "strategies: expected at least one, got none");
         ensure!(self.sessions > 0, "sessions: expected at least 1, got 0");
@@ -127,6 +153,15 @@ impl Experiment {
         Ok(())
     }
 
+    /// Control steps of an episode at most, on average over the plans: what there is to estimate from at the start.
+    fn steps_expected(&self, offered: &[OfferedTask]) -> f64 {
+        let steps = |plan: &EpisodePlan| {
+            let task = offered.iter().find(|task| task.id == plan.task);
+            task.map_or(0.0, |task| f64::from(task.steps_max))
+        };
+        self.plans.iter().map(steps).sum::<f64>() / self.plans.len().max(1) as f64
+    }
+
     /// True when somebody stopped it.
     async fn roll_out(
         &self,
@@ -135,16 +170,30 @@ impl Experiment {
         queue: Arc<RunQueue>,
     ) -> Result<bool> {
         let network = &deployment.network;
-        let wanted: BTreeSet<TaskId> = self.plans.iter().map(|plan| plan.task.clone()).collect();
-        offered_tasks(deployment, &wanted.into_iter().collect::<Vec<_>>()).await?;
+        let wanted: BTreeSet<&TaskId> = self.plans.iter().map(|plan| &plan.task).collect();
+        let is_offered = |offered: &[OfferedTask]| {
+            wanted.iter().all(|id| offered.iter().any(|task| task.id == **id))
+        };
+        let offered = offered_tasks(deployment, is_offered).await?;
+        ensure!(
+            is_offered(&offered),
+            "tasks: expected servers that offer {}, got servers of {}",
+            names(wanted.into_iter()),
+            names(offered.iter().map(|task| &task.id))
+        );
         let name = run.header.run.clone();
         let (scorer, _following) = self.scorers(deployment).await?;
         let summaries = run.summaries()?;
         let simulator = summaries.first().map(|summary| summary.simulator.clone());
-        let successes = summaries.iter().filter(|one| one.statistics.is_success).count();
-        let waiting = queue.progress().await?.waiting;
-        let done = summaries.len() as u64;
-        let progress = Progress::new(&self.title, done + waiting as u64, done, successes as u64);
+        let waiting = queue.progress().await?.waiting as u64;
+        let mut progress = Progress::new(&self.title, waiting, self.steps_expected(&offered));
+        for summary in summaries.iter().filter(|one| one.has_outcome()) {
+            progress.recorded_before(&summary.identity, summary.statistics.is_success);
+        }
+        if !self.is_quiet {
+            let (servers, sessions) = (network.fleet().borrow().servers.len(), self.sessions);
+            eprintln!("{servers} environment servers, up to {sessions} episodes at once");
+        }
         let outcomes = OutcomePublisher::declare(network, &name).await?;
         let mut sinks: Vec<Box<dyn EventSink>> = Vec::new();
         if self.record.video {
@@ -152,7 +201,11 @@ impl Experiment {
         }
         sinks.push(Box::new(StoreSink::new(run)));
         sinks.push(Box::new(OutcomeSink::new(outcomes)));
-        sinks.push(Box::new(progress));
+        if self.is_quiet {
+            sinks.push(Box::new(progress.silent()));
+        } else {
+            sinks.push(Box::new(progress));
+        }
         let pool = pool_options(self.policy.info(), name, simulator);
         let stop = stop::listen()?;
         let rollout = Rollout {
@@ -234,31 +287,22 @@ pub fn pool_options(policy: &PolicyInfo, holder: String, simulator: Option<Strin
     }
 }
 
-/// The wanted tasks as servers offer them. One that nobody offers is an error, for every one of its episodes would break.
-pub async fn offered_tasks(deployment: &Deployment, wanted: &[TaskId]) -> Result<Vec<OfferedTask>> {
-    let mut fleet = deployment.first_servers().await?;
-    let offers = |offered: &[OfferedTask]| -> Result<Vec<OfferedTask>, TaskId> {
-        let find = |id: &TaskId| offered.iter().find(|task| task.id == *id).cloned();
-        wanted.iter().map(|id| find(id).ok_or_else(|| id.clone())).collect()
-    };
-    if offers(&tasks_of(&fleet)).is_err() {
-        fleet = deployment.network.servers(fleet.servers.len() + 1, OTHERS_WAIT).await;
-    }
+/// The tasks of the servers that are found in time: of more servers than the first where `is_enough` says that these do not
+/// suffice.
+pub async fn offered_tasks(
+    deployment: &Deployment,
+    is_enough: impl Fn(&[OfferedTask]) -> bool,
+) -> Result<Vec<OfferedTask>> {
+    let fleet = deployment.first_servers().await?;
     let offered = tasks_of(&fleet);
-    offers(&offered).map_err(|task| {
-        let offered = offered.iter().map(|task| task.id.to_string()).collect();
-        anyhow::Error::new(UnknownTask { task, offered })
-    })
+    if is_enough(&offered) {
+        return Ok(offered);
+    }
+    Ok(tasks_of(&deployment.network.servers(fleet.servers.len() + 1, OTHERS_WAIT).await))
 }
 
-/// A task that no server offers.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("task: expected one of {}, got {task}", offered.join(", "))]
-pub struct UnknownTask {
-    /// The task.
-    pub task: TaskId,
-    /// What is offered.
-    pub offered: Vec<String>,
+fn names<'a>(tasks: impl Iterator<Item = &'a TaskId>) -> String {
+    tasks.map(TaskId::to_string).collect::<Vec<_>>().join(", ")
 }
 
 /// The tasks that servers offer in their default variant.
@@ -275,7 +319,7 @@ fn tasks_of(fleet: &Fleet) -> Vec<OfferedTask> {
     for offer in fleet.servers.values().flat_map(|server| &server.tasks) {
         let id = TaskId::new(&offer.task, &offer.variant);
         if tasks.iter().all(|task| task.id != id) {
-            tasks.push(OfferedTask { id, layouts: offer.layouts });
+            tasks.push(OfferedTask { id, layouts: offer.layouts, steps_max: offer.steps_max });
         }
     }
     tasks

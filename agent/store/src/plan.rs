@@ -37,6 +37,8 @@ pub struct OfferedTask {
     pub id: TaskId,
     /// How many fixed initial layouts it has.
     pub layouts: u32,
+    /// Control steps after which an episode is truncated.
+    pub steps_max: u32,
 }
 
 /// One episode to be run, not yet tied to a setting.

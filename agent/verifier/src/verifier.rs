@@ -26,15 +26,16 @@ pub struct Verifier {
 impl Verifier {
     /// Reads a verifier file; refuses one that was trained for another policy than the one with `policy_digest`.
     pub fn load(path: &Path, policy_digest: &str) -> anyhow::Result<Verifier> {
-        let read = || {
-            let bytes_found = std::fs::metadata(path)?.len();
-            ensure!(
-                bytes_found <= FILE_BYTES_MAX,
-                "expected at most {FILE_BYTES_MAX} bytes, got {bytes_found}"
-            );
-            Verifier::from_bytes(&std::fs::read(path)?, policy_digest)
-        };
-        read().with_context(|| format!("verifier {}", path.display()))
+        let bytes = read_file(path);
+        let verifier = bytes.and_then(|bytes| Verifier::from_bytes(&bytes, policy_digest));
+        verifier.with_context(|| format!("verifier {}", path.display()))
+    }
+
+    /// Reads a verifier's file, whatever policy it was trained for: to be looked at.
+    pub fn load_any(path: &Path) -> anyhow::Result<Verifier> {
+        let bytes = read_file(path);
+        let verifier = bytes.and_then(|bytes| Verifier::from_bytes_of_any_policy(&bytes));
+        verifier.with_context(|| format!("verifier {}", path.display()))
     }
 
     /// Reads the contents of a verifier file, for example as they came over the wire.
@@ -109,6 +110,13 @@ impl Verifier {
         };
         candidates.iter().enumerate().map(logit).collect()
     }
+}
+
+/// Of a size that the program accepts.
+fn read_file(path: &Path) -> anyhow::Result<Vec<u8>> {
+    let bytes = std::fs::metadata(path)?.len();
+    ensure!(bytes <= FILE_BYTES_MAX, "expected at most {FILE_BYTES_MAX} bytes, got {bytes}");
+    Ok(std::fs::read(path)?)
 }
 
 /// The logits of the well-formed candidates: that of the situation, and what each candidate changes.

@@ -101,7 +101,8 @@ impl ThroughputBench<'_> {
         let warm_up = WARM_UP_STEPS * sessions as u64;
         let queue = self.queue(&name, tasks, warm_up + self.decisions, sessions)?;
         let waiting = queue.progress().await?.waiting as u64;
-        let progress = Progress::new(&title, waiting, 0, 0);
+        let steps: f64 = tasks.iter().map(|task| f64::from(task.steps_max)).sum();
+        let progress = Progress::new(&title, waiting, steps / tasks.len().max(1) as f64);
         let counts = progress.counts();
         let (_never, stop) = watch::channel(Stop::No);
         let outcomes = OutcomePublisher::declare(&deployment.network, &name).await?;

@@ -17,7 +17,7 @@ use crate::bench::{
 use crate::build_info;
 use crate::files::{self, policy_folder};
 
-/// What the parts of the program cost on this machine.
+/// Measure what decisions, episodes, the wire and simulators cost on this machine
 #[derive(Debug, Args)]
 pub struct Arguments {
     #[command(subcommand)]
@@ -32,10 +32,10 @@ enum Part {
     Simulators(SimulatorsArguments),
 }
 
-/// One decision at a time on recorded observations: prefill, decode, parse, score, choose
+/// Measure one decision at a time on recorded observations: prefill, decode, parse, score, choose
 #[derive(Debug, Args)]
 struct DecisionArguments {
-    /// The checkpoint's folder [default: the one that comes with rever]
+    /// The checkpoint's folder [default: the policy that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
     /// Where the policy computes: cpu, cuda or cuda:N
@@ -50,18 +50,18 @@ struct DecisionArguments {
     /// Passes over all observations
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..))]
     rounds: u32,
-    /// Make the same decisions in PyTorch, in turns
+    /// Make the same decisions in PyTorch, alternating with rever's
     #[arg(long)]
     compare: bool,
-    /// A Python that has PyTorch, for --compare
+    /// Python with PyTorch, for --compare
     #[arg(long, value_name = "FILE", default_value = "python3")]
     python: PathBuf,
-    /// Write the figures into this file, too
+    /// Write the figures to this file as well
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 
-/// Whole episodes, many at once: decisions and episodes per second, and this process's memory
+/// Measure whole episodes, many at once: decisions and episodes per second, and this process's memory
 #[derive(Debug, Args)]
 struct ThroughputArguments {
     /// Episodes at once, separated by commas
@@ -77,41 +77,41 @@ struct ThroughputArguments {
     /// Server processes to start
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=64))]
     servers: u16,
-    /// What these processes are
+    /// The simulator of these servers
     #[arg(long, value_enum, default_value_t)]
     simulator: Simulator,
-    /// The checkpoint's folder, with its verifier [default: the one that comes with rever]
+    /// The checkpoint's folder, with its verifier [default: the policy that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
     /// Where the policy computes: cpu, cuda or cuda:N
     #[arg(long, default_value_t)]
     device: DeviceName,
-    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    /// Python for the servers, with the packages of env-server [default: one that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the figures into this file, too
+    /// Write the figures to this file as well
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 
-/// Control steps over the wire, less what the simulator took for them, beside repeated replies
+/// Measure control steps over the wire, minus the simulator's time, beside repeated replies
 #[derive(Debug, Args)]
 struct WireArguments {
-    /// Sessions of one server that ask at once, separated by commas
+    /// Sessions of one server that step at the same time, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "1,8,32",
           value_parser = clap::value_parser!(u16).range(1..=64))]
     sessions: Vec<u16>,
-    /// What the server is, one after the other, separated by commas
+    /// Simulators to measure, separated by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "native,python")]
     simulator: Vec<Simulator>,
     #[command(flatten)]
     steps: StepsArguments,
 }
 
-/// Control steps of the Python and the native server, in turns, with an image and without
+/// Measure control steps of the Python and the native server, with and without an image
 #[derive(Debug, Args)]
 struct SimulatorsArguments {
-    /// Sessions of each server that ask at once, separated by commas
+    /// Sessions of each server that step at the same time, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "1,2,4,8",
           value_parser = clap::value_parser!(u16).range(1..=64))]
     sessions: Vec<u16>,
@@ -128,10 +128,10 @@ struct StepsArguments {
     /// Height and width of the image
     #[arg(long, default_value_t = 224, value_parser = clap::value_parser!(u32).range(1..=1024))]
     side: u32,
-    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    /// Python for the servers, with the packages of env-server [default: one that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the figures into this file, too
+    /// Write the figures to this file as well
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }

@@ -9,33 +9,38 @@ use evaluation::suite::Layouts;
 use runtime::servers::Host;
 use store::plan::SeedRange;
 
+use super::Output;
 use super::episodes::{EpisodesArguments, Request};
 use super::evaluate::{show, temperature};
+use super::names::StrategyParser;
 
-/// Collect sampled episodes as labels, on random layouts that evaluation never sees.
+/// Collect sampled episodes as labels, on random initial layouts that evaluation never uses
 #[derive(Debug, Clone, Args)]
+#[command(after_help = "Examples:
+  rever collect --episodes 200                       800 labelled episodes of the four tasks, then: rever train
+  rever collect --policy FOLDER --episodes 300       for a verifier of your own checkpoint")]
 pub struct Arguments {
+    /// How the executed candidate is chosen; `sample` executes the first and records the others
+    #[arg(long, default_value = "sample", value_parser = StrategyParser)]
+    strategy: Strategy,
+    /// Candidates per step; a verifier learns to choose only from two or more
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=256))]
+    candidates: u32,
+    /// Sampling temperature
+    #[arg(long, value_name = "T", default_value_t = 1.0, value_parser = temperature)]
+    temperature: f32,
+    /// Episodes of each task
+    #[arg(long, default_value_t = 100, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..))]
+    episodes: u32,
     #[command(flatten)]
     episodes_arguments: EpisodesArguments,
-    /// How candidates are chosen; `sample` executes the first and records the others beside it.
-    #[arg(long, default_value = "sample")]
-    strategy: Strategy,
-    /// Episodes of each task.
-    #[arg(long, default_value_t = 100)]
-    episodes: u32,
-    /// Candidates per step; with one, no verifier can be trained to choose.
-    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=256))]
-    candidates: u32,
-    /// Sampling temperature.
-    #[arg(long, default_value_t = 1.0, value_parser = temperature)]
-    temperature: f32,
-    /// Write the results to this file, too.
-    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
+    /// Write the results to this file as well
+    #[arg(long, value_name = "FILE", value_parser = super::output_file, help_heading = "Files")]
     json: Option<PathBuf>,
 }
 
 /// Runs what is missing, then prints how many episodes succeeded.
-pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let Arguments { strategy, candidates, temperature, .. } = arguments;
     let setting = match strategy {
         // In an evaluation the candidates beside a sample would be a waste of time; here a verifier is trained on them.
@@ -52,8 +57,15 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             layouts: Layouts::Random,
             range: SeedRange::Collection,
             settings: vec![setting],
+            is_default: false,
+            output,
         },
     )?;
     println!("labels: {}", episodes_arguments.labels.display());
-    show(&outcome, arguments.json.as_deref())
+    show(&outcome, arguments.json.as_deref(), output)?;
+    let policy = episodes_arguments.policy.as_ref();
+    let policy =
+        policy.map_or_else(String::new, |folder| format!(" --policy {}", folder.display()));
+    println!("next: rever train {}{policy}", outcome.folder.display());
+    Ok(())
 }

@@ -8,28 +8,29 @@ use clap::Args;
 use conformance::{Row, Verdict, test};
 use runtime::servers::{Host, LocalSource, ServerSource, Simulator};
 
+use super::WrongUsage;
 use super::names::{FLEET_DEFAULT, endpoint, fleet};
 use crate::files;
 
-/// Test a server against the protocol's specification, row by row
+/// Test a server against the protocol's specification, rule by rule
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Start a server of ours and test it
+    /// Start one of rever's servers and test it
     #[arg(long, value_enum, conflicts_with = "connect")]
     server: Option<Simulator>,
-    /// Test a server that is running: its endpoint or a router's, as tcp/HOST:PORT
+    /// Test a running server: HOST:PORT of it or of a router
     #[arg(long, value_delimiter = ',', value_parser = endpoint)]
     connect: Vec<String>,
     /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
-    /// This server, when there are several [default: the first]
+    /// The id of the server to test, where there are several [default: the first]
     #[arg(long)]
     id: Option<String>,
-    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    /// Python for the server, with the packages of env-server [default: one that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the rows to this file, too
+    /// Write the results to this file as well
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
@@ -40,7 +41,9 @@ const SESSIONS: usize = 4;
 /// Prints each row when it is done; an error when one fails.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     if arguments.server.is_none() && arguments.connect.is_empty() {
-        bail!("expected --server or --connect, got none");
+        bail!(WrongUsage(
+            "conformance: expected --server python|native|robosuite or --connect HOST:PORT, got neither".to_owned()
+        ));
     }
     let start = |simulator| -> Result<LocalSource> {
         let installation = files::installation(host)?;
@@ -67,7 +70,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     println!("{passed} passed, {failed} failed, {} not tested", count(Verdict::Skip));
     ensure!(
         failed == 0,
-        "the server departs from the specification in {failed} of {} rows",
+        "the server departs from the specification in {failed} of {} rules",
         rows.len()
     );
     Ok(())

@@ -8,12 +8,11 @@ use clap::Args;
 use decision::{Setting, Strategy};
 use evaluation::result_file::ResultFile;
 use evaluation::suite::Layouts;
-use evaluation::table;
 use runtime::servers::Host;
 use store::plan::SeedRange;
 
 use super::episodes::{EpisodesArguments, Request};
-use super::report;
+use super::{Output, report};
 
 /// Environment servers: one per core of a small machine.
 const SERVERS: u16 = 2;
@@ -22,31 +21,31 @@ const SERVERS: u16 = 2;
 const CANDIDATES: u32 = 5;
 const TEMPERATURE: f32 = 1.0;
 
-/// Run every task with a single sample and with the verifier's choice, then build a report with videos.
+/// Compare a single sample with the verifier's choice on all tasks, then build a page with videos
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Random layouts of each task; each is run with a single sample and with the verifier
-    #[arg(long, default_value_t = 6)]
+    /// Random initial layouts of each task; each is run with a single sample and with the verifier
+    #[arg(long, default_value_t = 6, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..))]
     episodes: u32,
-    /// Another number gives other layouts
+    /// Another number gives other initial layouts
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// The run's folder; the same command resumes it [default: runs/demo-…]
+    /// The run's folder; the same command resumes it [default: a folder under runs/]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Also write the figures to this file, in the form of `rever evaluate`
+    /// Write the results to this file as well
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
-    /// A Python that has the packages already, instead of the one that is set up
+    /// Python for the servers, with the packages of env-server [default: one that rever sets up]
     #[arg(long)]
     python: Option<PathBuf>,
 }
 
 /// Runs the demonstration, prints its tables and where its page is.
-pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
+pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let started = Instant::now();
     println!(
-        "{} random layouts of each task, each with a single sample and with the verifier's choice of {CANDIDATES}",
+        "{} random initial layouts of each task, each with a single sample and with the verifier's choice of {CANDIDATES}",
         arguments.episodes
     );
     let setting = |strategy| Setting::new(strategy, CANDIDATES, TEMPERATURE);
@@ -67,15 +66,21 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             layouts: Layouts::Random,
             range: SeedRange::Evaluation,
             settings: vec![setting(Strategy::Sample), setting(Strategy::Verifier)],
+            is_default: false,
+            output,
         },
     )?;
     let out = outcome.folder.join("report");
     let page = report::build(&outcome.folder, &out, &outcome.policy, report::EPISODES_MAX)?;
-    println!("\n{}", table::text(&outcome.results));
+    println!("\n{}", output.results(&outcome.results));
     println!("{}", report::describe(&page));
     println!("done in {:.0} s", started.elapsed().as_secs_f64());
     if let Some(path) = &arguments.json {
         ResultFile::new(&outcome.results, outcome.provenance.clone())?.write(path)?;
     }
-    outcome.ending.ensure_complete(&outcome.folder)
+    outcome.ending.ensure_complete(&outcome.folder)?;
+    println!(
+        "next: open the page, or evaluate your own checkpoint: rever evaluate --policy FOLDER"
+    );
+    Ok(())
 }

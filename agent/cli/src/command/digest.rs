@@ -8,7 +8,7 @@ use store::record::EpisodeRecord;
 use store::run::{record_path, recorded};
 use store::{combined_digest, episode_digest, hex};
 
-/// Print a digest of what the episodes of a run did.
+/// Print a digest of what the episodes of a run did
 ///
 /// SHA-256 over identity, candidates' tokens, choices, statistics and states. Runs of one suite have one digest on every
 /// machine, whatever the number of servers, the order of episodes or interruptions.
@@ -16,7 +16,7 @@ use store::{combined_digest, episode_digest, hex};
 pub struct Arguments {
     /// The run's folder
     run: PathBuf,
-    /// Print a line for each episode, too
+    /// Print the digest of each episode as well
     #[arg(long)]
     episodes: bool,
 }

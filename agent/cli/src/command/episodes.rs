@@ -8,7 +8,7 @@ use clap::Args;
 use decision::{Scorer, Setting, TaskId};
 use evaluation::results::{Results, tasks_in_order};
 use evaluation::suite::{Layouts, Suite};
-use runtime::experiment::{self, Ending, Experiment, LoadScorer};
+use runtime::experiment::{Ending, Experiment, LoadScorer};
 use runtime::rollout::RecordOptions;
 use runtime::servers::{Deployment, Host, LocalSource, ServerSource, Simulator};
 use serde_json::{Value, json};
@@ -18,10 +18,10 @@ use store::plan::{OfferedTask, SeedRange};
 use store::run::{self, Run, RunRequest};
 use tokio::runtime::Runtime;
 use verifier::Verifier;
-use vla::{DeviceName, Vla};
+use vla::DeviceName;
 
-use super::WrongUsage;
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
+use super::{Output, WrongUsage, policy, selection};
 use crate::{build_info, files};
 
 /// Processes on this machine unless others are named.
@@ -30,61 +30,65 @@ const SERVERS_DEFAULT: u16 = 2;
 const SESSIONS_DEFAULT: u16 = 16;
 /// The label store of those that name none.
 const LABELS_DEFAULT: &str = "runs/labels.sqlite";
+/// A policy's own verifier, in its folder.
+const VERIFIER_FILE: &str = "verifier.safetensors";
 
 /// Which tasks, where, and what is kept of them.
 #[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "Episodes")]
 pub struct EpisodesArguments {
-    /// Tasks, separated by commas, each as TASK or TASK/VARIANT [default: all that the servers offer in their default variant].
-    #[arg(long, value_delimiter = ',')]
+    /// Tasks, separated by commas: whole names or words of them (`stack`), with `/VARIANT` for a variant; `rever list tasks`
+    /// shows them [default: all that the servers offer, in their default variant]
+    #[arg(long, value_delimiter = ',', value_parser = task)]
     pub tasks: Vec<TaskId>,
-    /// Seed of the suite: another number gives other layouts and other samples.
+    /// Seed of the suite: another number gives other initial layouts and other samples
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
-    /// The checkpoint's folder [default: the one that comes with rever].
-    #[arg(long)]
+    /// The checkpoint's folder [default: the policy that comes with rever]
+    #[arg(long, value_name = "FOLDER", help_heading = "Policy and verifier")]
     pub policy: Option<PathBuf>,
-    /// Where the policy computes: cpu, cuda or cuda:N.
-    #[arg(long, default_value_t)]
+    /// Where the policy computes: cpu, cuda or cuda:N
+    #[arg(long, default_value_t, help_heading = "Policy and verifier")]
     pub device: DeviceName,
-    /// The verifier's file [default: the one beside the policy's weights, if there is one].
-    #[arg(long)]
+    /// The verifier's file [default: verifier.safetensors in the policy's folder, if there is one]
+    #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
     pub verifier: Option<PathBuf>,
-    /// Follow a published verifier: take up its newest version between episodes.
-    #[arg(long, value_name = "NAME", value_parser = names::verifier)]
+    /// Follow a published verifier: take up its newest version between episodes
+    #[arg(long, value_name = "NAME", value_parser = names::verifier, help_heading = "Policy and verifier")]
     pub follow_verifier: Option<String>,
-    /// Server processes to start on this machine [default: 2].
-    #[arg(long, conflicts_with = "connect", value_parser = clap::value_parser!(u16).range(1..=64))]
+    /// Server processes to start on this machine [default: 2]
+    #[arg(long, conflicts_with = "connect", value_parser = clap::value_parser!(u16).range(1..=64), help_heading = "Servers")]
     pub servers: Option<u16>,
-    /// The simulator of these servers.
-    #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
+    /// The simulator of these servers
+    #[arg(long, value_enum, default_value_t, conflicts_with = "connect", help_heading = "Servers")]
     pub simulator: Simulator,
-    /// Use servers that are running: endpoints of them or of a router, as tcp/HOST:PORT.
-    #[arg(long, value_delimiter = ',', value_parser = endpoint)]
+    /// Use running servers: HOST:PORT of servers or of a router, separated by commas
+    #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', value_parser = endpoint, help_heading = "Servers")]
     pub connect: Vec<String>,
-    /// Listen here for others, such as a trainer that publishes verifiers [default: a socket of this machine, printed at the start].
-    #[arg(long, value_name = "ENDPOINT", value_delimiter = ',', value_parser = endpoint)]
+    /// Listen on HOST:PORT for others, such as a trainer that publishes verifiers [default: a socket of this machine]
+    #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', value_parser = endpoint, help_heading = "Servers")]
     pub listen: Vec<String>,
-    /// Namespace: peers see each other only within the same fleet.
-    #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
+    /// Namespace: peers see each other only within the same fleet
+    #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet, help_heading = "Servers")]
     pub fleet: String,
-    /// Episodes at once.
-    #[arg(long, default_value_t = SESSIONS_DEFAULT, value_parser = clap::value_parser!(u16).range(1..=256))]
+    /// Episodes at once
+    #[arg(long, default_value_t = SESSIONS_DEFAULT, value_parser = clap::value_parser!(u16).range(1..=256), help_heading = "Servers")]
     pub sessions: u16,
-    /// The run's folder; the same command resumes it [default: under runs/].
-    #[arg(long)]
-    pub out: Option<PathBuf>,
-    /// The label store.
-    #[arg(long, default_value = LABELS_DEFAULT)]
-    pub labels: PathBuf,
-    /// Keep a video of every episode.
-    #[arg(long)]
-    pub video: bool,
-    /// Keep the hidden states of all candidates, not only of the executed ones.
-    #[arg(long)]
-    pub all_hidden: bool,
-    /// A Python that has the packages of env-server, instead of the one that rever sets up.
-    #[arg(long, value_name = "FILE")]
+    /// Python for the servers, with the packages of env-server [default: one that rever sets up]
+    #[arg(long, value_name = "FILE", help_heading = "Servers")]
     pub python: Option<PathBuf>,
+    /// The run's folder; the same command resumes it [default: a folder under runs/]
+    #[arg(long, value_name = "FOLDER", help_heading = "Files")]
+    pub out: Option<PathBuf>,
+    /// The label store
+    #[arg(long, value_name = "FILE", default_value = LABELS_DEFAULT, help_heading = "Files")]
+    pub labels: PathBuf,
+    /// Record a video of every episode
+    #[arg(long, help_heading = "Files")]
+    pub video: bool,
+    /// Record the hidden states of all candidates, not only of the executed ones
+    #[arg(long, help_heading = "Files")]
+    pub all_hidden: bool,
 }
 
 /// What a command asks for beside the common arguments.
@@ -99,6 +103,10 @@ pub struct Request {
     pub range: SeedRange,
     /// How each episode is run.
     pub settings: Vec<Setting>,
+    /// Whether nobody named these settings, so that those which cannot be run are left out.
+    pub is_default: bool,
+    /// How much to show.
+    pub output: Output,
 }
 
 /// What a command has when its episodes are done.
@@ -144,12 +152,23 @@ impl EpisodesArguments {
     /// Runs what is not recorded yet, and computes the results of all that is.
     pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
         let folder = files::policy_folder(self.policy.as_ref(), host)?;
-        let policy = Vla::load(&folder, self.device)?;
+        let policy = policy::load(&folder, self.device)?;
         let digest = policy.parser().digest().to_owned();
         let verifier = self.verifier(&folder, &digest)?;
-        self.check(&request, verifier.as_deref())?;
-        let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-        let (tasks, mut deployment) = self.tasks(request.layouts, &runtime, host)?;
+        let settings = self.settings(&request, &folder, verifier.as_deref())?;
+        // Made, if there is none, before anything is run for it.
+        LabelStore::open(&self.labels).map(drop)?;
+        let runtime = Runtime::new().context("cannot start the async runtime")?;
+        let versions = build_info::versions(&digest, verifier.as_deref().map(Verifier::digest));
+        let names = |tasks: &[OfferedTask]| tasks.iter().map(|task| task.id.to_string()).collect();
+        let (tasks, deployment) = match self.recorded_tasks(&request, &settings, &versions) {
+            Some(tasks) => (tasks, None),
+            None => {
+                let deployment = self.open_servers(&runtime, host)?;
+                (selection::offered(&self.tasks, &deployment, &runtime)?, Some(deployment))
+            }
+        };
+        let options = self.options(names(&tasks), &request, &settings);
         let suite = Suite {
             tasks,
             episodes: request.episodes,
@@ -158,15 +177,7 @@ impl EpisodesArguments {
             seed: self.seed,
         };
         let plans = suite.episodes().map_err(|error| WrongUsage(error.to_string()))?;
-        let options = self.options(&suite, &request.settings);
-        let versions = build_info::versions(&digest, verifier.as_deref().map(Verifier::digest));
         let run_folder = self.run_folder(request.title, &options, &versions);
-        if deployment.is_none() && !run_folder.exists() {
-            // Refused here, a task that nobody offers leaves no run behind.
-            let servers = self.open_servers(&runtime, host)?;
-            runtime.block_on(experiment::offered_tasks(&servers, &self.tasks))?;
-            deployment = Some(servers);
-        }
         let run = Run::open(&RunRequest {
             folder: run_folder.clone(),
             labels: Some(self.labels.clone()),
@@ -178,13 +189,14 @@ impl EpisodesArguments {
         let experiment = Experiment {
             title: request.title.to_owned(),
             plans,
-            settings: request.settings,
+            settings,
             policy: Arc::new(policy),
             scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
             follow_verifier: self.follow_verifier.clone().map(|name| (name, load_scorer(digest))),
             sessions: usize::from(self.sessions),
             record: RecordOptions { all_hidden: self.all_hidden, video: self.video },
             versions: build_info::record_versions(),
+            is_quiet: request.output.is_quiet,
         };
         let ending = experiment.run(run, &runtime, || match deployment {
             Some(deployment) => Ok(deployment),
@@ -196,54 +208,71 @@ impl EpisodesArguments {
 
     /// The named verifier, or the one beside the policy's weights; none where one is followed and none is named.
     fn verifier(&self, policy: &Path, digest: &str) -> Result<Option<Arc<Verifier>>> {
-        let beside = policy.join("verifier.safetensors");
+        let beside = policy.join(VERIFIER_FILE);
         let is_beside = self.follow_verifier.is_none() && beside.is_file();
         let path = self.verifier.clone().or_else(|| is_beside.then_some(beside));
-        path.map(|path| Ok(Arc::new(Verifier::load(&path, digest)?))).transpose()
+        let load = |path: PathBuf| Verifier::load(&path, digest).map(Arc::new);
+        let verifier = path.map(load).transpose();
+        verifier.map_err(|error| WrongUsage(format!("{error:#}")).into())
     }
 
-    /// Wrong usage that can be told before anything is started.
-    fn check(&self, request: &Request, verifier: Option<&Verifier>) -> Result<()> {
-        let needing = request.settings.iter().find(|setting| setting.strategy.needs_verifier());
-        if let (Some(setting), None, None) = (needing, verifier, &self.follow_verifier) {
+    /// The settings to run; wrong usage where one needs a verifier and there is none. Settings that nobody named do without.
+    fn settings(
+        &self,
+        request: &Request,
+        policy: &Path,
+        verifier: Option<&Verifier>,
+    ) -> Result<Vec<Setting>> {
+        let settings = &request.settings;
+        let is_possible = |setting: &Setting| {
+            !setting.strategy.needs_verifier()
+                || verifier.is_some()
+                || self.follow_verifier.is_some()
+        };
+        let Some(setting) = settings.iter().find(|setting| !is_possible(setting)) else {
+            return Ok(settings.clone());
+        };
+        let remedy = format!(
+            "there is no {VERIFIER_FILE} in {}; train one with `rever collect --policy {0}` and `rever train --policy {0}`",
+            policy.display()
+        );
+        if !request.is_default {
             let strategy = setting.strategy;
             bail!(WrongUsage(format!(
-                "strategy {strategy}: expected a verifier (--verifier FILE), got none"
+                "strategy {strategy}: expected a verifier (--verifier FILE), got none: {remedy}"
             )));
         }
-        // Made, if there is none, before anything is run for it.
-        LabelStore::open(&self.labels).map(drop)
+        eprintln!("without a verifier: {remedy}");
+        Ok(settings.iter().copied().filter(is_possible).collect())
     }
 
-    /// The tasks that were asked for, or all that servers offer. Servers are started here only where their descriptions are
-    /// needed: for the list of tasks, or for the number of fixed layouts.
-    fn tasks(
+    /// The whole names of the tasks where the run is there already, so that servers are only started if something is missing.
+    fn recorded_tasks(
         &self,
-        layouts: Layouts,
-        runtime: &Runtime,
-        host: &Host,
-    ) -> Result<(Vec<OfferedTask>, Option<Deployment>)> {
-        if !self.tasks.is_empty() && layouts == Layouts::Random {
-            let unasked = |id: &TaskId| OfferedTask { id: id.clone(), layouts: 0 };
-            return Ok((self.tasks.iter().map(unasked).collect(), None));
+        request: &Request,
+        settings: &[Setting],
+        versions: &Value,
+    ) -> Option<Vec<OfferedTask>> {
+        if self.tasks.is_empty() || request.layouts == Layouts::Grid {
+            return None;
         }
-        let deployment = self.open_servers(runtime, host)?;
-        let tasks = match &self.tasks[..] {
-            [] => runtime.block_on(experiment::default_tasks(&deployment))?,
-            wanted => runtime.block_on(experiment::offered_tasks(&deployment, wanted))?,
-        };
-        Ok((tasks, Some(deployment)))
+        let typed = self.tasks.iter().map(TaskId::to_string).collect();
+        let options = self.options(typed, request, settings);
+        let folder = self.run_folder(request.title, &options, versions);
+        let header = run::read_header(&folder).ok()?;
+        let tasks = selection::matching(&self.tasks, &tasks_in_order(&header.options)).ok()?;
+        let task = |id| OfferedTask { id, layouts: 0, steps_max: 0 };
+        Some(tasks.into_iter().map(task).collect())
     }
 
     /// Everything that decides the results, by name. Where it runs and how many episodes at once does not.
-    fn options(&self, suite: &Suite, settings: &[Setting]) -> Value {
-        let Suite { tasks, episodes, layouts, range, seed } = suite;
+    fn options(&self, tasks: Vec<String>, request: &Request, settings: &[Setting]) -> Value {
         json!({
-            "tasks": tasks.iter().map(|task| task.id.to_string()).collect::<Vec<_>>(),
-            "episodes": episodes,
-            "layouts": layouts,
-            "seeds_from": range.first(),
-            "seed": seed,
+            "tasks": tasks,
+            "episodes": request.episodes,
+            "layouts": request.layouts,
+            "seeds_from": request.range.first(),
+            "seed": self.seed,
             "settings": settings.iter().map(Setting::to_string).collect::<Vec<_>>(),
             "follow_verifier": self.follow_verifier,
             // Sums in another order: the same draws, but for the rare one between two tokens.
@@ -285,6 +314,13 @@ impl EpisodesArguments {
     }
 }
 
+/// How many episodes the options of a run's header ask for.
+pub fn planned(header: &Value) -> u64 {
+    let options = &header["options"];
+    let settings = options["settings"].as_array().map_or(0, Vec::len) as u64;
+    tasks_in_order(options).len() as u64 * settings * options["episodes"].as_u64().unwrap_or(0)
+}
+
 /// Reads published verifiers for the policy with this digest.
 fn load_scorer(policy: String) -> LoadScorer {
     Arc::new(move |update| {
@@ -293,8 +329,13 @@ fn load_scorer(policy: String) -> LoadScorer {
     })
 }
 
+/// Parses a task's name as it is typed.
+fn task(text: &str) -> Result<TaskId, String> {
+    text.trim().parse()
+}
+
 /// Results of all that is recorded in a run, and what they were made with.
-fn results(folder: &Path) -> Result<(Results, Value)> {
+pub fn results(folder: &Path) -> Result<(Results, Value)> {
     let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
     let mut provenance = serde_json::to_value(&header)?;
     // Of the header's form, not of the result file's.

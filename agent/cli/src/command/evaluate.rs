@@ -7,64 +7,84 @@ use clap::Args;
 use decision::{Setting, Strategy};
 use evaluation::result_file::ResultFile;
 use evaluation::suite::Layouts;
-use evaluation::table;
 use runtime::servers::Host;
 use store::plan::SeedRange;
 
+use super::Output;
 use super::episodes::{EpisodesArguments, Outcome, Request};
+use super::names::StrategyParser;
 
-/// Evaluate strategies on the same paired episodes; the same command resumes.
+const STRATEGIES_DEFAULT: [Strategy; 3] = [Strategy::Greedy, Strategy::Sample, Strategy::Verifier];
+
+/// Evaluate strategies on the same paired episodes; the same command resumes
 #[derive(Debug, Clone, Args)]
+#[command(after_help = "Examples:
+  rever evaluate                                     greedy, sample and verifier on SIMPLER's 24 layouts of each task
+  rever evaluate --tasks stack --strategies sample,verifier --layouts random --episodes 100
+  rever evaluate --strategies verifier --candidates 1,2,5,8              success against the number of candidates
+  rever evaluate --policy FOLDER --strategies greedy,sample              your own checkpoint
+  rever evaluate --connect 10.0.0.7:7447                                 on servers of another machine")]
 pub struct Arguments {
-    #[command(flatten)]
-    episodes_arguments: EpisodesArguments,
-    /// greedy, sample, first-well-formed, majority, medoid, verifier, worst, verifier+medoid, oracle; separated by commas.
-    #[arg(long, value_delimiter = ',', default_value = "greedy,sample,verifier")]
+    /// Strategies, separated by commas [default: greedy,sample,verifier; without the last where there is no verifier]
+    #[arg(long, value_delimiter = ',', value_parser = StrategyParser)]
     strategies: Vec<Strategy>,
-    /// Episodes of each task; with 24, each of SIMPLER's layouts once.
-    #[arg(long, default_value_t = 24)]
+    /// Candidates per step; several numbers, separated by commas, show success against N
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "5", value_parser = clap::value_parser!(u32).range(1..=256))]
+    candidates: Vec<u32>,
+    /// Sampling temperature; several numbers may be given, separated by commas
+    #[arg(long, value_name = "T", value_delimiter = ',', default_value = "1", value_parser = temperature)]
+    temperature: Vec<f32>,
+    /// Episodes of each task and setting; with 24, each of SIMPLER's layouts once
+    #[arg(long, default_value_t = 24, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..))]
     episodes: u32,
-    /// Each task's fixed initial layouts, over and over, or random ones from the held-out range.
+    /// The fixed initial layouts of each task, in turn, or random ones from the held-out range of seeds
     #[arg(long, value_enum, default_value = "grid")]
     layouts: Layouts,
-    /// Candidates per step; several, separated by commas, give success against N.
-    #[arg(long, value_delimiter = ',', default_value = "5", value_parser = clap::value_parser!(u32).range(1..=256))]
-    candidates: Vec<u32>,
-    /// Sampling temperature; several may be given, separated by commas.
-    #[arg(long, value_delimiter = ',', default_value = "1", value_parser = temperature)]
-    temperature: Vec<f32>,
-    /// Write the results to this file, too.
-    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
+    #[command(flatten)]
+    episodes_arguments: EpisodesArguments,
+    /// Write the results to this file as well
+    #[arg(long, value_name = "FILE", value_parser = super::output_file, help_heading = "Files")]
     json: Option<PathBuf>,
 }
 
-/// Runs what is missing, then prints the tables.
-pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
+/// Runs what is missing, then prints the answer.
+pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let Arguments { strategies, temperature, candidates, .. } = &arguments;
+    let is_default = strategies.is_empty();
+    let strategies = if is_default { &STRATEGIES_DEFAULT[..] } else { strategies };
+    let settings = Setting::all(strategies, temperature, candidates);
+    for setting in settings.iter().filter(|one| one.temperature == 0.0 && one.candidates > 1) {
+        eprintln!("{setting}: at temperature 0 all candidates are the same");
+    }
     let request = Request {
         title: "evaluate",
         episodes: arguments.episodes,
         layouts: arguments.layouts,
         range: SeedRange::Evaluation,
-        settings: Setting::all(strategies, temperature, candidates),
+        settings,
+        is_default,
+        output,
     };
     let outcome = arguments.episodes_arguments.run(host, request)?;
-    show(&outcome, arguments.json.as_deref())
+    show(&outcome, arguments.json.as_deref(), output)?;
+    println!("next: rever report {}", outcome.folder.display());
+    Ok(())
 }
 
-/// Prints the tables of an outcome and writes its file; an error when it is partial.
-pub fn show(outcome: &Outcome, json: Option<&Path>) -> Result<()> {
-    print!("{}", table::text(&outcome.results));
-    println!("records: {}", outcome.folder.display());
+/// Prints the results of an outcome and writes its file; an error when it is partial.
+pub fn show(outcome: &Outcome, json: Option<&Path>, output: Output) -> Result<()> {
+    print!("{}", output.results(&outcome.results));
     if let Some(path) = json {
         ResultFile::new(&outcome.results, outcome.provenance.clone())?.write(path)?;
     }
+    println!("records: {}", outcome.folder.display());
     outcome.ending.ensure_complete(&outcome.folder)
 }
 
 /// A temperature that can be sampled at.
 pub fn temperature(text: &str) -> Result<f32, String> {
-    let temperature: f32 = text.parse().map_err(|_| format!("expected a number, got {text:?}"))?;
+    let temperature: f32 =
+        text.trim().parse().map_err(|_| format!("expected a number, got {text:?}"))?;
     if temperature.is_finite() && temperature >= 0.0 {
         Ok(temperature)
     } else {

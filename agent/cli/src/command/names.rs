@@ -1,15 +1,23 @@
-//! Endpoints and names on the network, as arguments: what cannot be used is wrong usage, not a failure after a wait.
+//! Names as arguments: endpoints, fleets, verifiers, strategies. What cannot be used is wrong usage, found before any wait.
 
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use decision::Strategy;
 use protocol::Keys;
 use runtime::wire::check_endpoint;
 
 /// The fleet of those that name none.
 pub const FLEET_DEFAULT: &str = "local";
 
-/// Parses `tcp/HOST:PORT`.
+/// Parses `HOST:PORT` or an endpoint as zenoh writes it, `tcp/HOST:PORT`.
 pub fn endpoint(text: &str) -> Result<String, String> {
-    check_endpoint(text).map_err(|error| error.to_string())?;
-    Ok(text.to_owned())
+    let text = text.trim();
+    let whole = match text.contains('/') {
+        true => text.to_owned(),
+        false => format!("tcp/{text}"),
+    };
+    check_endpoint(&whole)
+        .map_err(|_| format!("expected HOST:PORT, such as 192.168.0.7:7447, got {text:?}"))?;
+    Ok(whole)
 }
 
 /// Parses a fleet's name.
@@ -23,4 +31,64 @@ pub fn verifier(text: &str) -> Result<String, String> {
     let keys = Keys::new(FLEET_DEFAULT).and_then(|keys| keys.verifier(text));
     keys.map_err(|error| error.to_string())?;
     Ok(text.to_owned())
+}
+
+/// Parses the name of a strategy; help lists all of them with their meanings.
+#[derive(Clone)]
+pub struct StrategyParser;
+
+impl TypedValueParser for StrategyParser {
+    type Value = Strategy;
+
+    fn parse_ref(
+        &self,
+        command: &clap::Command,
+        argument: Option<&clap::Arg>,
+        value: &std::ffi::OsStr,
+    ) -> Result<Strategy, clap::Error> {
+        let names = PossibleValuesParser::new(Strategy::ALL.map(Strategy::name));
+        let trimmed = value.to_str().map(|text| text.trim().to_owned());
+        let value = trimmed.map_or_else(|| value.to_owned(), Into::into);
+        let name = names.parse_ref(command, argument, &value)?;
+        let named = Strategy::ALL.into_iter().find(|strategy| strategy.name() == name);
+        Ok(named.expect("one of their names"))
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        let value = |strategy: Strategy| {
+            PossibleValue::new(strategy.name()).help(strategy_meaning(strategy))
+        };
+        Some(Box::new(Strategy::ALL.into_iter().map(value)))
+    }
+}
+
+/// What a strategy does, in one line.
+pub fn strategy_meaning(strategy: Strategy) -> &'static str {
+    match strategy {
+        Strategy::Greedy => "the most likely token at every position; one candidate",
+        Strategy::Sample => "one sampled candidate: the baseline",
+        Strategy::FirstWellFormed => "the first of N candidates that holds a valid action",
+        Strategy::Majority => "the action that most candidates agree with (self-consistency)",
+        Strategy::Medoid => "the candidate nearest to all others",
+        Strategy::Verifier => "the highest verifier score: ReVer",
+        Strategy::Worst => "the lowest verifier score: a control",
+        Strategy::VerifierMedoid => "verifier score minus the distance to the other candidates",
+        Strategy::Oracle => "the candidate nearest to the scripted expert: an upper bound",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_host_and_a_port_are_enough() {
+        assert_eq!(endpoint("10.0.0.7:7447").as_deref(), Ok("tcp/10.0.0.7:7447"));
+        assert_eq!(endpoint(" localhost:1 ").as_deref(), Ok("tcp/localhost:1"));
+        assert_eq!(endpoint("tcp/[::1]:7447").as_deref(), Ok("tcp/[::1]:7447"));
+        for wrong in ["localhost", "tls/a:1", "a:99999", ""] {
+            let error = endpoint(wrong).expect_err("no port, or no transport");
+            assert!(error.starts_with("expected HOST:PORT"), "{wrong}: {error}");
+        }
+    }
 }

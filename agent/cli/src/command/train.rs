@@ -25,60 +25,65 @@ use crate::files::policy_folder;
 /// How long to look for agents that follow the verifier before it is published to nobody yet.
 const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
 
-/// Train a verifier on collected episodes.
+/// Train a verifier on collected episodes
 #[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  rever train                                        on all collected episodes of this folder's label store
+  rever train runs/collect-1a2b3c4d --out mine.safetensors
+  rever train --policy FOLDER --out FOLDER/verifier.safetensors      found beside the policy from then on")]
 pub struct Arguments {
-    /// Runs to train on; every episode in them must be eligible [default: the label store].
+    /// Runs to train on; every episode in them must be eligible [default: the label store]
+    #[arg(value_parser = run_folder)]
     runs: Vec<PathBuf>,
-    /// Label store to train on; episodes that are not eligible are excluded and counted.
+    /// Label store to train on; episodes that are not eligible are excluded and counted
     #[arg(long, default_value = "runs/labels.sqlite", conflicts_with = "runs")]
     labels: PathBuf,
-    /// Folder of the policy whose hidden states the records hold [default: the one that comes with rever].
+    /// Folder of the policy whose hidden states the records hold [default: the policy that comes with rever]
     #[arg(long, value_name = "FOLDER")]
     policy: Option<PathBuf>,
-    /// The verifier's file.
+    /// The file to write the verifier to
     #[arg(long, default_value = "verifier.safetensors", value_parser = super::output_file)]
     out: PathBuf,
-    /// Seed of the split, the first weights and the order of samples.
+    /// Seed of the split, of the initial weights and of the order of samples
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
-    /// Passes over the samples at most.
+    /// Epochs at most
     #[arg(long, default_value_t = TrainingOptions::default().epochs_max)]
     epochs: usize,
-    /// Sizes of the two hidden layers.
+    /// Sizes of the two hidden layers
     #[arg(long, num_args = 2, value_delimiter = ',', default_values_t = TrainingOptions::default().hidden_sizes)]
     hidden_sizes: Vec<usize>,
-    /// Step size of the optimizer.
+    /// Learning rate of the optimizer
     #[arg(long, default_value_t = TrainingOptions::default().learning_rate)]
     learning_rate: f64,
-    /// Weight decay of the optimizer.
+    /// Weight decay of the optimizer
     #[arg(long, default_value_t = TrainingOptions::default().weight_decay)]
     weight_decay: f64,
-    /// Share of each task's initial layouts whose loss decides when training stops.
+    /// Share of each task's initial layouts whose loss decides when training stops
     #[arg(long, default_value_t = TrainingOptions::default().validation_share)]
     validation_share: f64,
-    /// Share of each task's initial layouts that is held out for the printed figures.
+    /// Share of each task's initial layouts that is held out for the printed figures
     #[arg(long, default_value_t = TrainingOptions::default().held_out_share)]
     held_out_share: f64,
-    /// What the weights of the nearness to the target are multiplied by; 0 leaves the target out.
+    /// Factor on the weights of the distance to the predicted target; 0 leaves the target out
     #[arg(long, default_value_t = TrainingOptions::default().target_factor)]
     target_factor: f64,
-    /// Leave out the ranking of candidates: the paper's verifier.
+    /// Train the paper's verifier: without the ranking of candidates
     #[arg(long)]
     plain: bool,
-    /// Also write the figures to this file.
+    /// Write the results to this file as well
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
-    /// Publish the verifier under this name to agents that follow it.
+    /// Publish the verifier under this name to agents that follow it
     #[arg(long, requires = "connect", value_parser = names::verifier)]
     name: Option<String>,
-    /// Router or agent to publish through, as tcp/HOST:PORT.
+    /// HOST:PORT of the router or agent to publish through
     #[arg(long, requires = "name", value_parser = endpoint)]
     connect: Vec<String>,
-    /// Namespace: peers see each other only within the same fleet.
+    /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
-    /// After publishing, stay until Ctrl-C so that agents that start later get the verifier too.
+    /// After publishing, stay until Ctrl-C so that agents that start later receive the verifier
     #[arg(long, requires = "name")]
     keep_publishing: bool,
 }
@@ -109,7 +114,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let (episodes, excluded) = read(&arguments, &parser, &action_space)?;
     ensure!(
         !episodes.is_empty(),
-        "training: expected eligible episodes, got none; excluded: {}",
+        "training: expected eligible episodes, got none; excluded: {}; run `rever collect` first",
         counts(&excluded)
     );
     let set = TrainingSet::new(parser.hidden_size(), action_space.length(), episodes)?;
@@ -119,7 +124,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     write_whole(&arguments.out, verifier.bytes())?;
     print!("{}", table(&verifier));
     let out = arguments.out.display();
-    println!("written to {out}");
+    println!("verifier: {out}");
     if let Some(json) = &arguments.json {
         let result = ResultFile {
             verifier: verifier.digest(),
@@ -135,6 +140,13 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         Some(name) => publish(&arguments, name, &verifier),
         None => Ok(()),
     }
+}
+
+/// Parses the folder of a run.
+fn run_folder(text: &str) -> Result<PathBuf, String> {
+    let folder = PathBuf::from(text);
+    store::run::read_header(&folder).map_err(|error| format!("{error:#}"))?;
+    Ok(folder)
 }
 
 fn read(
@@ -175,7 +187,7 @@ fn report(epoch: Epoch, options: &TrainingOptions) {
     let mark = if is_best { ", best so far" } else { "" };
     let epochs_max = options.epochs_max;
     eprintln!(
-        "pass {epoch} of at most {epochs_max}: training loss {training_loss:.4}, validation loss {validation_loss:.4}{mark}"
+        "epoch {epoch} of at most {epochs_max}: training loss {training_loss:.4}, validation loss {validation_loss:.4}{mark}"
     );
 }
 
@@ -192,7 +204,7 @@ fn counts(excluded: &Excluded) -> String {
 }
 
 /// What the verifier was trained on, and the held-out figures: per task first, because the pooled one misleads.
-fn table(verifier: &Verifier) -> String {
+pub fn table(verifier: &Verifier) -> String {
     let VerifierDescription { policy, data, held_out, .. } = verifier.description();
     let mut rows = vec![
         ["held-out AUROC", "all steps", "first 10", "middle", "last 10"]
@@ -285,7 +297,7 @@ fn publish(arguments: &Arguments, name: &str, verifier: &Verifier) -> Result<()>
             println!("published {digest} as {name}, but no agent follows it yet");
         }
         if arguments.keep_publishing {
-            println!("keeping it for agents that start later; Ctrl-C ends");
+            println!("serving it to agents that start later; Ctrl-C ends");
             tokio::signal::ctrl_c().await?;
         }
         drop(publisher);

@@ -5,12 +5,19 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use store::record::EpisodeIdentity;
 use tokio::sync::watch;
 
 use super::{Event, EventSink};
 
 /// How often a plain line is printed where there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
+/// Faults for the same reason within this time are told together: a lost server breaks all of its episodes.
+const SAME_FAULT: Duration = Duration::from_secs(2);
+/// More strategies than this are told together, in one rate.
+const RATES_MAX: usize = 3;
+/// Ticks of the bar: progress is counted in control steps, whose final number is not known.
+const TICKS: u64 = 10_000;
 
 /// What a run has done since it was started.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -24,49 +31,91 @@ pub struct Counts {
 /// How far a run has come. Episodes that were recorded before this start count as done, but not for the estimate.
 pub struct Progress {
     bar: Option<ProgressBar>,
-    total: u64,
-    done: u64,
-    successes: u64,
+    is_silent: bool,
+    /// Episodes that were recorded before this start.
+    before: u64,
+    /// Episodes to record.
+    waiting: u64,
     counts: watch::Sender<Counts>,
     /// Steps of the episodes that were recorded since the start.
     steps_recorded: u64,
+    /// Steps of an episode, as long as none is recorded.
+    steps_expected: f64,
+    rates: Vec<StrategyRate>,
     faults: u64,
-    running: usize,
+    last_fault: Option<LastFault>,
     started: Instant,
     printed: Instant,
 }
 
+/// Successes of one strategy.
+struct StrategyRate {
+    strategy: String,
+    successes: u64,
+    episodes: u64,
+}
+
+/// The last reason that was told, and how many more episodes have broken for it.
+struct LastFault {
+    reason: String,
+    at: Instant,
+    others: u64,
+}
+
 impl Progress {
-    /// `done` of `total` episodes are recorded already, `successes` of them successful.
-    pub fn new(title: &str, total: u64, done: u64, successes: u64) -> Progress {
+    /// Of a run with `waiting` episodes to record, each of about `steps_expected` control steps.
+    pub fn new(title: &str, waiting: u64, steps_expected: f64) -> Progress {
         let bar = std::io::stderr().is_terminal().then(|| {
-            let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {msg}");
+            let style = ProgressStyle::with_template("{prefix} {bar:20} {wide_msg}");
             let bar =
-                ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(4));
+                ProgressBar::with_draw_target(Some(TICKS), ProgressDrawTarget::stderr_with_hz(4));
             bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
                 .with_prefix(title.to_owned())
         });
-        if bar.is_none() {
-            eprintln!("{title}: {done} of {total} episodes recorded");
-        }
         let now = Instant::now();
         Progress {
             bar,
-            total,
-            done,
-            successes,
+            is_silent: false,
+            before: 0,
+            waiting,
             counts: watch::Sender::default(),
             steps_recorded: 0,
+            steps_expected: steps_expected.max(1.0),
+            rates: Vec::new(),
             faults: 0,
-            running: 0,
+            last_fault: None,
             started: now,
             printed: now,
         }
     }
 
+    /// Shows nothing but faults and notices.
+    pub fn silent(mut self) -> Progress {
+        self.bar = None;
+        self.is_silent = true;
+        self
+    }
+
+    /// An episode that was recorded before this start.
+    pub fn recorded_before(&mut self, identity: &EpisodeIdentity, is_success: bool) {
+        self.before += 1;
+        self.count(identity, is_success);
+    }
+
     /// Counters for throughput measurement.
     pub fn counts(&self) -> watch::Receiver<Counts> {
         self.counts.subscribe()
+    }
+
+    fn count(&mut self, identity: &EpisodeIdentity, is_success: bool) {
+        let strategy = &identity.strategy;
+        let known = self.rates.iter().position(|rate| rate.strategy == *strategy);
+        let index = known.unwrap_or(self.rates.len());
+        if known.is_none() {
+            self.rates.push(StrategyRate { strategy: strategy.clone(), successes: 0, episodes: 0 });
+        }
+        self.rates[index].episodes += 1;
+        self.rates[index].successes += u64::from(is_success);
     }
 
     /// One control step of one episode is over.
@@ -76,18 +125,33 @@ impl Progress {
     }
 
     /// An episode of so many steps is recorded.
-    fn recorded(&mut self, is_success: bool, steps: usize) {
-        self.done += 1;
+    fn recorded(&mut self, steps: usize) {
         self.counts.send_modify(|counts| counts.episodes += 1);
         self.steps_recorded += steps as u64;
-        self.successes += u64::from(is_success);
         self.show();
     }
 
     /// An attempt broke.
-    fn faulted(&mut self, reason: &str) {
+    fn faulted(&mut self, episode: &str, reason: &str) {
         self.faults += 1;
-        self.say(&format!("fault: {reason}"));
+        if let Some(last) = &mut self.last_fault
+            && last.reason == reason
+            && last.at.elapsed() < SAME_FAULT
+        {
+            last.others += 1;
+            return;
+        }
+        self.tell_others();
+        self.say(&format!("fault: {reason} ({episode} is retried)"));
+        self.last_fault =
+            Some(LastFault { reason: reason.to_owned(), at: Instant::now(), others: 0 });
+    }
+
+    /// How many more episodes broke for the reason that was told.
+    fn tell_others(&mut self) {
+        if let Some(LastFault { others: others @ 1.., .. }) = self.last_fault.take() {
+            self.say(&format!("the same fault in {others} more episodes, which are retried"));
+        }
     }
 
     /// Prints a line without breaking the bar.
@@ -98,48 +162,67 @@ impl Progress {
         }
     }
 
-    /// Leaves the last state on the screen.
-    fn leave(&self) {
-        let line = self.line(self.started.elapsed());
-        match &self.bar {
-            Some(bar) => bar.abandon_with_message(line),
-            None => eprintln!("{}/{} {line}", self.done, self.total),
+    fn show(&mut self) {
+        if self.last_fault.as_ref().is_some_and(|last| last.at.elapsed() >= SAME_FAULT) {
+            self.tell_others();
+        }
+        if self.is_silent {
+            return;
+        }
+        let elapsed = self.started.elapsed();
+        if let Some(bar) = &self.bar {
+            bar.set_position((self.share() * TICKS as f64) as u64);
+            bar.set_message(self.line(elapsed));
+        } else if self.printed.elapsed() >= LINE_EVERY {
+            self.printed = Instant::now();
+            eprintln!("{}", self.line(elapsed));
         }
     }
 
-    fn show(&mut self) {
-        if let Some(bar) = &self.bar {
-            bar.set_position(self.done);
-            bar.set_message(self.line(self.started.elapsed()));
-        } else if self.printed.elapsed() >= LINE_EVERY {
-            self.printed = Instant::now();
-            eprintln!("{}/{} {}", self.done, self.total, self.line(self.started.elapsed()));
+    /// Steps of one episode: measured, as soon as one is recorded.
+    fn steps_each(&self) -> f64 {
+        match self.counts.borrow().episodes {
+            0 => self.steps_expected,
+            episodes => self.steps_recorded as f64 / episodes as f64,
         }
+    }
+
+    /// Control steps that are still to be done.
+    fn steps_left(&self) -> f64 {
+        let Counts { steps, episodes } = *self.counts.borrow();
+        // Counted in steps: episodes that began together end together, so their own rate comes in waves.
+        let ahead = steps.saturating_sub(self.steps_recorded) as f64;
+        (self.waiting.saturating_sub(episodes) as f64 * self.steps_each() - ahead).max(0.0)
+    }
+
+    /// What is done of the whole run, 0 to 1.
+    fn share(&self) -> f64 {
+        let whole = (self.before + self.waiting) as f64 * self.steps_each();
+        1.0 - self.steps_left() / whole.max(1.0)
     }
 
     fn line(&self, elapsed: Duration) -> String {
         let secs = elapsed.as_secs_f64().max(1e-3);
-        let Counts { steps, episodes: here } = *self.counts.borrow();
-        let mut parts = Vec::new();
-        if self.done > 0 {
-            parts
-                .push(format!("success {:.0} %", 100.0 * self.successes as f64 / self.done as f64));
+        let Counts { steps, episodes } = *self.counts.borrow();
+        let (done, total) = (self.before + episodes, self.before + self.waiting);
+        let mut parts = vec![format!("{done}/{total} episodes")];
+        if episodes == self.waiting {
+            parts.push(format!("in {}", clock(secs)));
+        } else if steps > 0 {
+            parts.push(format!("{} left", clock(self.steps_left() * secs / steps as f64)));
         }
         parts.push(format!("{:.1} steps/s", steps as f64 / secs));
+        if self.rates.len() > RATES_MAX {
+            let sum = |of: fn(&StrategyRate) -> u64| self.rates.iter().map(of).sum::<u64>();
+            let (successes, episodes) = (sum(|one| one.successes), sum(|one| one.episodes));
+            parts.push(format!("success {}", percent(successes, episodes)));
+        } else {
+            parts.extend(self.rates.iter().map(|rate| {
+                format!("{} {}", rate.strategy, percent(rate.successes, rate.episodes))
+            }));
+        }
         if self.faults > 0 {
             parts.push(format!("{} faults", self.faults));
-        }
-        // Counted in steps: episodes that began together end together, so their own rate comes in waves.
-        if here > 0 && self.done < self.total {
-            let steps_expected =
-                (self.total - self.done) as f64 * self.steps_recorded as f64 / here as f64;
-            let steps_ahead = (steps - self.steps_recorded) as f64;
-            let left = (steps_expected - steps_ahead).max(0.0) * secs / steps.max(1) as f64;
-            parts.push(format!("{} left", clock(left)));
-        } else if self.done < self.total {
-            parts.push(format!("{} running", self.running));
-        } else {
-            parts.push(format!("in {}", clock(secs)));
         }
         parts.join(", ")
     }
@@ -148,29 +231,41 @@ impl Progress {
 impl EventSink for Progress {
     fn on(&mut self, event: &Event) -> Result<()> {
         match event {
-            Event::Started { .. } => self.running += 1,
+            Event::Started { .. } => {}
             Event::Stepped { .. } => self.stepped(),
             Event::Recorded(record) => {
-                self.running = self.running.saturating_sub(1);
-                self.recorded(
-                    record.has_outcome() && record.statistics.is_success,
-                    record.steps.len(),
-                );
+                if record.has_outcome() {
+                    self.count(&record.identity, record.statistics.is_success);
+                }
+                self.recorded(record.steps.len());
             }
             Event::Faulted(fault) => {
-                self.running = self.running.saturating_sub(1);
-                let id = fault.identity.id();
-                self.faulted(&format!("{id} (attempt {}): {}", fault.attempt, fault.reason));
+                let id = format!("{}, attempt {}", fault.identity.id(), fault.attempt);
+                self.faulted(&id, &fault.reason);
             }
             Event::Notice(line) => self.say(line),
         }
         Ok(())
     }
 
+    /// Leaves the last state on the screen.
     fn finish(&mut self) -> Result<()> {
-        self.leave();
+        self.tell_others();
+        let line = self.line(self.started.elapsed());
+        match &self.bar {
+            Some(bar) => {
+                bar.set_position((self.share() * TICKS as f64) as u64);
+                bar.abandon_with_message(line);
+            }
+            None if !self.is_silent => eprintln!("{line}"),
+            None => {}
+        }
         Ok(())
     }
+}
+
+fn percent(successes: u64, episodes: u64) -> String {
+    format!("{:.0} %", 100.0 * successes as f64 / episodes.max(1) as f64)
 }
 
 /// Seconds as a person reads them.
@@ -187,6 +282,21 @@ fn clock(secs: f64) -> String {
 mod tests {
     use super::*;
 
+    fn identity(strategy: &str, episode: u32) -> EpisodeIdentity {
+        EpisodeIdentity {
+            run: "run".to_owned(),
+            task: "stack".to_owned(),
+            variant: "default".to_owned(),
+            layout: None,
+            seed: u64::from(episode),
+            episode,
+            strategy: strategy.to_owned(),
+            candidates: 1,
+            temperature: 1.0,
+            sampling_seed: 0,
+        }
+    }
+
     #[test]
     fn durations_are_readable() {
         let read = [0.4, 59.4, 61.0, 3599.0, 7320.0].map(clock);
@@ -194,14 +304,34 @@ mod tests {
     }
 
     #[test]
-    fn the_estimate_counts_only_what_this_start_has_done() {
-        let mut progress = Progress::new("test", 20, 10, 5);
-        progress.running = 4;
+    fn the_estimate_is_there_from_the_first_step_and_counts_only_what_this_start_has_done() {
+        let mut progress = Progress::new("test", 10, 20.0);
+        (0..10).for_each(|episode| {
+            progress.recorded_before(&identity("sample", episode), episode < 5)
+        });
         (0..40).for_each(|_| progress.stepped());
-        assert_eq!(progress.line(Duration::from_secs(10)), "success 50 %, 4.0 steps/s, 4 running");
-        progress.recorded(true, 10);
-        progress.recorded(true, 10);
+        // Of ten episodes with about 20 steps each, 40 steps are done.
+        let line = progress.line(Duration::from_secs(10));
+        assert_eq!(line, "10/20 episodes, 40 s left, 4.0 steps/s, sample 50 %");
+        assert!((progress.share() - 0.6).abs() < 1e-9, "{}", progress.share());
+        for episode in 10..12 {
+            progress.count(&identity("verifier", episode), true);
+            progress.recorded(10);
+        }
         // Two episodes had 10 steps each, so the eight that are left have 80; of these, 20 are done.
-        assert_eq!(progress.line(Duration::from_secs(10)), "success 58 %, 4.0 steps/s, 15 s left");
+        let line = progress.line(Duration::from_secs(10));
+        assert_eq!(line, "12/20 episodes, 15 s left, 4.0 steps/s, sample 50 %, verifier 100 %");
+    }
+
+    #[test]
+    fn faults_for_one_reason_are_told_together() {
+        let mut progress = Progress::new("test", 10, 20.0);
+        for episode in 0..8 {
+            progress.faulted(&identity("sample", episode).id(), "server 27f5 is gone");
+        }
+        assert_eq!(progress.faults, 8);
+        assert_eq!(progress.last_fault.as_ref().map(|last| last.others), Some(7));
+        progress.faulted("another", "physics diverged");
+        assert_eq!(progress.last_fault.as_ref().map(|last| last.others), Some(0));
     }
 }

@@ -2,12 +2,13 @@
 
 use std::net::{Ipv4Addr, TcpListener};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use anyhow::{Context, anyhow, ensure};
+use anyhow::{Context, anyhow, bail, ensure};
 use protocol::{Keys, transport};
 use rustix::process::{Resource, getrlimit};
 use tempfile::TempDir;
+use tokio::net::TcpStream;
 use zenoh::Session;
 
 use super::discovery::{Discovery, Fleet};
@@ -16,7 +17,11 @@ use super::local_endpoint::{ANY_LOOPBACK_PORT, local_endpoint};
 /// Another process may take a port between its choice and its use.
 const PORT_ATTEMPTS_MAX: usize = 10;
 /// A client waits this long for the router or server that it is told to connect to.
-const CLIENT_WAIT_MS: u32 = 30_000;
+const CLIENT_WAIT_MS: u32 = 10_000;
+/// A router or server that is being started, too, may listen a little later.
+const LISTENER_WAIT: Duration = Duration::from_secs(5);
+/// Between two attempts to connect to it.
+const LISTENER_PAUSE: Duration = Duration::from_millis(250);
 /// For zenoh's threads and sockets and a few servers' pipes.
 const OPEN_FILES_MIN: u64 = 64;
 
@@ -106,9 +111,7 @@ impl Network {
             .iter()
             .chain(&options.listen)
             .try_for_each(|place| check_endpoint(place))?;
-        for place in &options.connect {
-            check_host(place).await?;
-        }
+        check_connections(&options.connect).await?;
         let here = options.listen_here.then(|| local_endpoint(&tempfile::env::temp_dir()));
         let here = here.transpose()?;
         let (here, folder) = here.unzip();
@@ -194,11 +197,38 @@ pub fn check_endpoint(endpoint: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// An error for a host whose name nobody knows; zenoh would ask for it again for as long as it may.
-async fn check_host(endpoint: &str) -> anyhow::Result<()> {
-    let Some(address) = endpoint.strip_prefix("tcp/") else { return Ok(()) };
-    let known = tokio::net::lookup_host(address).await;
-    known.map(drop).map_err(|error| anyhow!("endpoint {endpoint}: {error}"))
+/// An error where a host's name is unknown or nothing listens at any of the endpoints. zenoh would retry both for as long as
+/// it may, and then not say which of them it was.
+async fn check_connections(endpoints: &[String]) -> anyhow::Result<()> {
+    let addresses: Vec<&str> =
+        endpoints.iter().filter_map(|endpoint| endpoint.strip_prefix("tcp/")).collect();
+    for address in &addresses {
+        let known = tokio::net::lookup_host(address).await;
+        known.map(drop).map_err(|error| anyhow!("cannot connect to {address}: {error}"))?;
+    }
+    if addresses.len() < endpoints.len() || addresses.is_empty() {
+        return Ok(());
+    }
+    let begun = Instant::now();
+    loop {
+        let mut refusals = Vec::new();
+        for address in &addresses {
+            match tokio::time::timeout(LISTENER_WAIT, TcpStream::connect(address)).await {
+                Ok(Ok(_)) => return Ok(()),
+                Ok(Err(error)) => {
+                    refusals.push(format!("{address}: {}", transport::in_words(error)))
+                }
+                Err(_) => refusals.push(format!("{address}: no answer")),
+            }
+        }
+        if begun.elapsed() >= LISTENER_WAIT {
+            bail!(
+                "cannot connect to {}; expected an environment server or a zenoh router that listens there",
+                refusals.join(", ")
+            );
+        }
+        tokio::time::sleep(LISTENER_PAUSE).await;
+    }
 }
 
 async fn open_session(
@@ -215,7 +245,10 @@ async fn open_session(
                 let reason = transport::in_words(error);
                 return Err(match &options.connect[..] {
                     [] => anyhow!("cannot listen on {}: {reason}", listening.join(", ")),
-                    connect => anyhow!("cannot connect to {}: {reason}", connect.join(", ")),
+                    connect => anyhow!(
+                        "cannot connect to {}: what listens there does not answer as zenoh does ({reason})",
+                        connect.join(", ")
+                    ),
                 });
             }
             Err(_) => attempt += 1,

@@ -35,6 +35,13 @@ pub struct EpisodeSummary {
     pub simulator_ms: Vec<f32>,
 }
 
+impl EpisodeSummary {
+    /// Whether the episode has an outcome, see [`EpisodeRecord::has_outcome`].
+    pub fn has_outcome(&self) -> bool {
+        (self.held_steps as usize) < self.decision_ms.len()
+    }
+}
+
 impl From<&EpisodeRecord> for EpisodeSummary {
     fn from(record: &EpisodeRecord) -> EpisodeSummary {
         let candidates = || record.decisions().flat_map(|decision| &decision.candidates);

@@ -38,6 +38,23 @@ impl CompletionParser {
         &self.digest
     }
 
+    /// What the checkpoint is, as names and values to show.
+    pub fn description(&self) -> Vec<(&'static str, String)> {
+        let Config { towers, image_size, text, vocabulary, reasoning, .. } = &self.config;
+        let towers: Vec<String> =
+            towers.iter().map(|one| format!("{} x {}", one.depth, one.embed_dim)).collect();
+        vec![
+            ("image", format!("{image_size} x {image_size}")),
+            ("vision blocks", towers.join(" and ")),
+            ("decoder blocks", format!("{} x {}", text.num_hidden_layers, text.hidden_size)),
+            ("vocabulary", vocabulary.to_string()),
+            ("chain of thought", if *reasoning { "yes" } else { "no" }.to_owned()),
+            ("tokens at most", self.config.completion_tokens_max.to_string()),
+            ("prompt", format!("{:?}", self.config.prompt_template)),
+            ("action", format!("{ACTION_LENGTH} numbers, {} bins each", self.config.action_bins)),
+        ]
+    }
+
     /// Length of a candidate's hidden state.
     pub fn hidden_size(&self) -> usize {
         self.config.text.hidden_size

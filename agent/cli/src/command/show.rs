@@ -1,0 +1,77 @@
+//! `rever show`: what a run, a verifier or a policy is, without running anything.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use clap::Args;
+use serde_json::Value;
+use store::run;
+use verifier::Verifier;
+use vla::CompletionParser;
+
+use super::{Output, WrongUsage, episodes, train};
+
+/// Show the results of a run, the quality of a verifier, or what a policy is
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  rever show runs/evaluate-1a2b3c4d        its results again; with -v all tables
+  rever show verifier.safetensors          what it was trained on, and its held-out quality
+  rever show FOLDER                        a checkpoint's sizes, prompt and digest")]
+pub struct Arguments {
+    /// A run's folder, a verifier's file or a checkpoint's folder
+    path: PathBuf,
+}
+
+/// Prints it.
+pub fn run(arguments: &Arguments, output: Output) -> Result<()> {
+    let path = &arguments.path;
+    if run::read_header(path).is_ok() {
+        show_run(path, output)
+    } else if path.is_file() {
+        print!("{}", train::table(&Verifier::load_any(path)?));
+        println!("next: rever evaluate --strategies sample,verifier --verifier {}", path.display());
+        Ok(())
+    } else if path.join("config.json").is_file() {
+        show_policy(path)
+    } else {
+        Err(WrongUsage(format!(
+            "show: expected a run's folder (run.json), a checkpoint's folder (config.json) or a verifier's file, got {}; \
+             `rever list runs` lists runs",
+            path.display()
+        ))
+        .into())
+    }
+}
+
+fn show_run(path: &Path, output: Output) -> Result<()> {
+    let (results, provenance) = episodes::results(path)?;
+    print!("{}", output.results(&results));
+    let (recorded, planned) = (run::recorded(path)?.len(), episodes::planned(&provenance));
+    println!("{recorded} of {planned} episodes recorded");
+    let starts = provenance["starts"].as_array().map_or(&[][..], Vec::as_slice);
+    for start in starts {
+        let words = start["command"].as_array().map_or(&[][..], Vec::as_slice);
+        let words: Vec<&str> = words.iter().filter_map(Value::as_str).collect();
+        let (time, commit) = (text(&start["time"]), text(&start["build"]["commit"]));
+        println!("{time}, commit {commit}: {}", words.join(" "));
+    }
+    for name in ["policy", "verifier"] {
+        println!("{name}: {}", text(&provenance["versions"][name]));
+    }
+    println!("next: rever report {}", path.display());
+    Ok(())
+}
+
+fn show_policy(folder: &Path) -> Result<()> {
+    let parser = CompletionParser::load(folder)?;
+    println!("policy {}: digest {}", folder.display(), parser.digest());
+    for (name, value) in parser.description() {
+        println!("  {name:<22} {value}");
+    }
+    println!("next: rever evaluate --policy {}", folder.display());
+    Ok(())
+}
+
+fn text(value: &Value) -> &str {
+    value.as_str().unwrap_or("-")
+}
