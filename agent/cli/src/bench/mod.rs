@@ -1,6 +1,6 @@
 //! What decisions and episodes cost on this machine, beside the same weights in PyTorch.
 //!
-//! Times of one table are taken in turns, so that a machine that slows down slows all of them down.
+//! The sides of a table are measured alternately: a machine that slows down slows all of them down.
 
 mod bandwidth;
 mod decision;
@@ -10,9 +10,9 @@ mod throughput;
 mod torch;
 mod wire;
 
-pub use decision::{DecisionBench, Report};
+pub use decision::{DecisionBench, Report, Row as DecisionRow};
 pub use observations::read as read_observations;
-pub use simulators::SimulatorsBench;
-pub use throughput::ThroughputBench;
+pub use simulators::{Row as SimulatorsRow, SimulatorsBench};
+pub use throughput::{Row as ThroughputRow, ThroughputBench};
 pub use torch::Torch;
-pub use wire::WireBench;
+pub use wire::{Row as WireRow, WireBench};

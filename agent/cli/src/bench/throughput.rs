@@ -117,7 +117,7 @@ impl ThroughputBench<'_> {
             sinks: Sinks::start(vec![
                 Box::new(StoreSink::new(run)),
                 Box::new(OutcomeSink::new(outcomes)),
-                Box::new(progress),
+                Box::new(progress.silent()),
             ])?,
             sessions,
             options: RecordOptions::default(),

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
+use evaluation::table::aligned;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use runtime::servers::{Host, LocalSource, ServerSource, Simulator};
@@ -12,7 +13,8 @@ use verifier::Verifier;
 use vla::{DeviceName, Vla};
 
 use crate::bench::{
-    DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench, read_observations,
+    self, DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench,
+    read_observations,
 };
 use crate::build_info;
 use crate::files::{self, policy_folder};
@@ -159,39 +161,38 @@ fn wire(arguments: WireArguments, host: &Host) -> Result<()> {
     if let Some(path) = &arguments.steps.json {
         write_json(path, serde_json::json!({ "side": side, "rows": rows }))?;
     }
-    println!(
-        "{:>9} {:>8} {:>7} {:>8} {:>12} {:>8} {:>8} {:>9} {:>8} {:>8} {:>7}",
-        "simulator",
+    let row = |row: &bench::WireRow| {
+        vec![
+            row.simulator.to_string(),
+            row.sessions.to_string(),
+            row.steps.to_string(),
+            format!("{:.3}", row.step_ms_p50),
+            format!("{:.3}", row.simulator_ms_p50),
+            format!("{:.3}", row.wire_ms_p50),
+            format!("{:.3}", row.wire_ms_p95),
+            format!("{:.1} %", 100.0 * row.wire_ms_p50 / row.step_ms_p50),
+            format!("{:.3}", row.repeat_ms_p50),
+            format!("{:.3}", row.bare_ms_p50),
+            format!("{:.1}", row.reply_bytes_p50 / 1e3),
+        ]
+    };
+    let head = [
+        "",
         "sessions",
         "steps",
-        "step ms",
-        "simulator ms",
-        "wire ms",
-        "wire p95",
-        "repeat ms",
-        "reply kB",
-        "bare ms",
-        "share"
-    );
-    for row in rows {
-        println!(
-            "{:>9} {:>8} {:>7} {:>8.3} {:>12.3} {:>8.3} {:>8.3} {:>9.3} {:>8.1} {:>8.3} {:>5.1} %",
-            row.simulator.to_string(),
-            row.sessions,
-            row.steps,
-            row.step_ms_p50,
-            row.simulator_ms_p50,
-            row.wire_ms_p50,
-            row.wire_ms_p95,
-            row.repeat_ms_p50,
-            row.reply_bytes_p50 / 1e3,
-            row.bare_ms_p50,
-            100.0 * row.wire_ms_p50 / row.step_ms_p50
-        );
-    }
+        "step",
+        "simulator",
+        "wire",
+        "p95",
+        "share",
+        "repeat",
+        "bare",
+        "kB",
+    ];
+    print_table(&head, rows.iter().map(row));
     println!(
-        "one server of each, {side} x {side} pixels; per step of all sessions, medians; wire: a step less its simulator's time; \
-         repeat: the same reply again; bare: as many bytes through a socket"
+        "Medians in ms per step of all sessions, {side} x {side} pixels, one server of each kind. wire: a step minus its\n\
+         simulator's time; share: of the step; repeat: the same reply again; bare: as many bytes through a socket; kB: reply"
     );
     Ok(())
 }
@@ -210,22 +211,21 @@ fn simulators(arguments: SimulatorsArguments, host: &Host) -> Result<()> {
     if let Some(path) = &arguments.steps.json {
         write_json(path, serde_json::json!({ "rows": rows }))?;
     }
-    println!(
-        "{:>6} {:>8} {:>7} {:>9} {:>9} {:>6}",
-        "pixels", "sessions", "steps", "python", "native", "ratio"
-    );
-    for row in rows {
+    let row = |row: &bench::SimulatorsRow| {
         let (python, native) = (row.python_steps_per_second, row.native_steps_per_second);
-        println!(
-            "{:>6} {:>8} {:>7} {python:>9.1} {native:>9.1} {:>6.2}",
-            row.side,
-            row.sessions,
-            row.steps,
-            native / python
-        );
-    }
+        vec![
+            row.side.to_string(),
+            row.sessions.to_string(),
+            row.steps.to_string(),
+            format!("{python:.1}"),
+            format!("{native:.1}"),
+            format!("{:.2}", native / python),
+        ]
+    };
+    let head = ["pixels", "sessions", "steps", "python", "native", "ratio"];
+    print_table(&head, rows.iter().map(row));
     println!(
-        "control steps per second of one server process, in turns; 0 pixels: nothing is rendered"
+        "control steps per second of one server process, measured alternately; 0 pixels: nothing is rendered"
     );
     Ok(())
 }
@@ -266,23 +266,28 @@ fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
     if let Some(path) = &arguments.json {
         write_json(path, serde_json::json!({ "candidates": arguments.candidates, "rows": rows }))?;
     }
-    println!(
-        "{:>8} {:>10} {:>12} {:>11} {:>9} {:>9}",
-        "sessions", "decisions", "decisions/s", "episodes/s", "MB before", "MB after"
-    );
-    for row in rows {
-        println!(
-            "{:>8} {:>10} {:>12.1} {:>11.2} {:>9.1} {:>9.1}",
-            row.sessions,
-            row.decisions,
-            row.decisions_per_second,
-            row.episodes_per_second,
-            row.memory_mb_before,
-            row.memory_mb_after
-        );
-    }
+    let row = |row: &bench::ThroughputRow| {
+        // Without one that ended, the rate is not known.
+        let episodes = (row.episodes_per_second > 0.0).then_some(row.episodes_per_second);
+        vec![
+            row.sessions.to_string(),
+            row.decisions.to_string(),
+            format!("{:.1}", row.decisions_per_second),
+            episodes.map_or_else(|| "-".to_owned(), |rate| format!("{rate:.2}")),
+            format!("{:.1}", row.memory_mb_before),
+            format!("{:.1}", row.memory_mb_after),
+        ]
+    };
+    let head = ["sessions", "decisions", "decisions/s", "episodes/s", "MB before", "MB after"];
+    print_table(&head, rows.iter().map(row));
     println!("{} candidates, {} server processes", arguments.candidates, arguments.servers);
     Ok(())
+}
+
+/// Columns of numbers below their names.
+fn print_table(head: &[&str], rows: impl Iterator<Item = Vec<String>>) {
+    let head = head.iter().map(|name| (*name).to_owned()).collect();
+    print!("{}", aligned(&std::iter::once(head).chain(rows).collect::<Vec<_>>()));
 }
 
 /// Writes an object of figures, with the build that measured them.
@@ -334,35 +339,25 @@ fn decision(arguments: DecisionArguments, host: &Host) -> Result<()> {
 }
 
 fn print(report: &Report) {
-    println!(
-        "{:>10} {:>5} {:>10} {:>8} {:>7} {:>9} {:>9} {:>9} {:>10}",
-        "candidates",
-        "T",
-        "prefill ms",
-        "step ms",
-        "tokens",
-        "p50 ms",
-        "p95 ms",
-        "tokens/s",
-        "bandwidth"
-    );
-    for row in &report.rows {
-        println!(
-            "{:>10} {:>5} {:>10.2} {:>8.3} {:>7.1} {:>9.1} {:>9.1} {:>9.0} {:>8.0} %",
-            row.setting.candidates,
-            row.setting.temperature,
-            row.prefill_ms,
-            row.step_ms,
-            row.tokens,
-            row.decision_ms_p50,
-            row.decision_ms_p95,
-            row.tokens_per_second,
-            100.0 * row.bandwidth_share,
-        );
-    }
+    let row = |row: &bench::DecisionRow| {
+        vec![
+            row.setting.candidates.to_string(),
+            row.setting.temperature.to_string(),
+            format!("{:.2}", row.prefill_ms),
+            format!("{:.3}", row.step_ms),
+            format!("{:.1}", row.tokens),
+            format!("{:.1}", row.decision_ms_p50),
+            format!("{:.1}", row.decision_ms_p95),
+            format!("{:.0}", row.tokens_per_second),
+            format!("{:.0} %", 100.0 * row.bandwidth_share),
+        ]
+    };
+    let head =
+        ["N", "T", "prefill ms", "step ms", "tokens", "p50 ms", "p95 ms", "tokens/s", "bandwidth"];
+    print_table(&head, report.rows.iter().map(row));
     let megabytes = report.rows.first().map_or(0.0, |row| row.weight_bytes as f64 / 1e6);
     println!(
-        "{} decisions each, {} threads; a step reads {megabytes:.1} MB of weights, this machine reads as much at {:.1} GB/s",
+        "{} decisions each, {} threads. A token step reads {megabytes:.1} MB of weights; this machine\nreads as much at {:.1} GB/s.",
         report.decisions,
         report.threads,
         report.bandwidth_bytes_per_second / 1e9,
@@ -377,7 +372,7 @@ fn print(report: &Report) {
         println!("PyTorch: {why}");
     }
     println!(
-        "ratio_greedy {:.2} (five verified candidates over one greedy one)",
+        "ratio_greedy {:.2} (five verified candidates over one greedy candidate)",
         report.ratio_greedy
     );
     if let (Some(eager), Some(best)) = (report.ratio_eager, report.ratio_best) {

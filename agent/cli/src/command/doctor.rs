@@ -25,28 +25,28 @@ use crate::files;
 /// The image size where there is no policy that asks for another.
 const IMAGE_SIZE_DEFAULT: (usize, usize) = (128, 128);
 
-/// Check everything that a run needs, and change nothing: Python, rendering, policy, verifier, servers.
+/// Check what a run needs and change nothing: Python, rendering, policy, verifier, servers
 #[derive(Debug, Clone, Args)]
 pub struct Arguments {
-    /// The checkpoint's folder [default: the one that comes with rever]
-    #[arg(long)]
+    /// The checkpoint's folder [default: the policy that comes with rever]
+    #[arg(long, value_name = "FOLDER")]
     policy: Option<PathBuf>,
-    /// The verifier's file [default: the one beside the policy's weights]
-    #[arg(long)]
+    /// The verifier's file [default: verifier.safetensors in the policy's folder]
+    #[arg(long, value_name = "FILE")]
     verifier: Option<PathBuf>,
     /// Start a server of this simulator
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
     simulator: Simulator,
-    /// Check servers that are running instead of one started here
-    #[arg(long, value_delimiter = ',', value_parser = endpoint)]
+    /// Check running servers instead of one started here: HOST:PORT, separated by commas
+    #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', value_parser = endpoint)]
     connect: Vec<String>,
     /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
-    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    /// Python for the server, with the packages of env-server [default: one that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Also write the findings to this file
+    /// Write the findings to this file as well
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
