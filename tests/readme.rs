@@ -169,9 +169,7 @@ fn a_command_that_is_wrong_is_noticed() {
 #[test]
 fn short_commands_of_the_readme_run() {
     let workplace = Workplace::new();
-    let readme = read("README.md");
-    let written: Vec<String> =
-        fenced(&readme, "sh").into_iter().flat_map(commands_of).chain(quoted(&readme)).collect();
+    let written = commands_of_readme();
     for (command, smaller) in RUN {
         assert!(written.iter().any(|line| line == command), "README has no longer: {command}");
         let output = workplace.shell(&format!("{command} {smaller}"));
@@ -181,13 +179,24 @@ fn short_commands_of_the_readme_run() {
 }
 
 #[test]
-fn readmes_server_serves_readmes_example() {
+fn readmes_example_runs() {
     let readme = read("README.md");
-    let commands: Vec<String> = fenced(&readme, "sh").into_iter().flat_map(commands_of).collect();
+    let examples = fenced(&readme, "python");
+    assert_eq!(examples.len(), 1, "README has one example in Python");
+    let said = succeed(python().command().args(["-c", examples[0]]));
+    assert!(["success\n", "failure\n"].contains(&said.as_str()), "{said:?}");
+}
+
+#[test]
+fn readmes_servers_are_found() {
+    let workplace = Workplace::new();
+    let commands = commands_of_readme();
+    let command = |start: &str| -> &str {
+        let found = commands.iter().find(|line| line.starts_with(start));
+        found.unwrap_or_else(|| panic!("README has no longer: {start}"))
+    };
     let endpoint = free_endpoint();
-    let here = |text: &str| text.replace("tcp/127.0.0.1:7447", &endpoint);
-    let serve = commands.iter().find(|line| line.contains("serve --listen tcp/127.0.0.1:7447"));
-    let serve = here(serve.expect("README starts a server"));
+    let serve = command("python -m rever_env serve").replace("tcp/0.0.0.0:7447", &endpoint);
     let mut words = serve.split_whitespace();
     assert_eq!(words.next(), Some("python"));
     let mut server = python().command();
@@ -197,10 +206,13 @@ fn readmes_server_serves_readmes_example() {
     let stdout = server.0.stdout.take().expect("its standard output is piped");
     BufReader::new(stdout).read_line(&mut line).expect("its standard output is text");
     assert!(line.starts_with("ready"), "{line:?}");
-    let examples = fenced(&readme, "python");
-    assert_eq!(examples.len(), 1, "README has one example in Python");
-    let said = succeed(python().command().args(["-c", &here(examples[0])]));
-    assert!(["success\n", "failure\n"].contains(&said.as_str()), "{said:?}");
+    // One machine of the three, and a doctor in place of an evaluation.
+    let evaluate = command("rever evaluate --connect A:7447,B:7447,C:7447 ");
+    let address = endpoint.trim_start_matches("tcp/");
+    let connect = evaluate.split_whitespace().nth(3).expect("it names servers");
+    let connect = connect.split(',').map(|_| address).collect::<Vec<_>>().join(",");
+    let output = workplace.shell(&format!("rever doctor --connect {connect} --python=$PYTHON"));
+    assert!(output.status.success(), "{}", text(&output));
 }
 
 /// A process that is killed with its test.
@@ -301,6 +313,12 @@ fn documents() -> Vec<String> {
     let mut paths: Vec<String> = names.map(|name| format!("agent/docs/{name}")).collect();
     paths.sort();
     DOCUMENTS.map(str::to_owned).into_iter().chain(paths).collect()
+}
+
+/// In blocks and in running text.
+fn commands_of_readme() -> Vec<String> {
+    let readme = read("README.md");
+    fenced(&readme, "sh").into_iter().flat_map(commands_of).chain(quoted(&readme)).collect()
 }
 
 fn read(path: &str) -> String {
