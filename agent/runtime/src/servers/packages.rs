@@ -340,7 +340,10 @@ if [ "$2" = venv ]; then mkdir -p "$last/bin"; cp "$0" "$last/bin/python"; fi
                    'NewConnectionError: Failed to establish a new connection: Name or service not known'\nERROR: No \
                    matching distribution found for absl-py==2.5.1";
         let said = explain_network(anyhow!(pip)).to_string();
-        assert!(said.starts_with("cannot reach a package index: is this machine offline?"), "{said}");
+        assert!(
+            said.starts_with("cannot reach a package index: is this machine offline?"),
+            "{said}"
+        );
         assert!(said.contains("Name or service not known") && !said.contains("absl-py"), "{said}");
         let other = "python ended with exit status: 1\nNo space left on device";
         assert_eq!(explain_network(anyhow!(other)).to_string(), other);

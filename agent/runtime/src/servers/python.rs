@@ -11,8 +11,8 @@ use sha2::{Digest, Sha256};
 
 use super::installation::{Installation, Missing};
 use super::packages::PackageList;
-use super::system_packages::{GL_PACKAGES, install_missing};
 use super::program::Simulator;
+use super::system_packages::{GL_PACKAGES, install_missing};
 use super::{variables, wheel};
 
 const SERVERS_LOCK: &str = "requirements.lock";
@@ -147,7 +147,8 @@ pub fn named_environment(
     let output = output.with_context(|| format!("--python {name}: expected a Python"))?;
     let said = String::from_utf8_lossy(&output.stdout);
     let mut lines = said.lines();
-    let version = lines.next().filter(|line| output.status.success() && line.starts_with("Python "));
+    let version =
+        lines.next().filter(|line| output.status.success() && line.starts_with("Python "));
     let Some(version) = version else {
         let said = last_lines(&output);
         let last = said.lines().next_back().map(|line| format!(": {line}")).unwrap_or_default();
@@ -161,7 +162,9 @@ pub fn named_environment(
     // Files that were unpacked for this command alone are gone when it ends.
     let install = match installation.is_temporary() {
         true => String::new(),
-        false => format!("install its packages with `{name} -m pip install -r {}`, or ", lock.display()),
+        false => {
+            format!("install its packages with `{name} -m pip install -r {}`, or ", lock.display())
+        }
     };
     ensure!(
         lacking.is_empty(),
