@@ -1,8 +1,10 @@
-//! Tells the program the commit that it is built from, and when, and packs the files that it carries.
+//! Tells the program the commit that it is built from, and when, packs the files that it carries, and lays out the Python
+//! package for the wheel.
 
 #![allow(clippy::disallowed_methods, reason = "cargo tells a build script everything in variables")]
 
 use std::error::Error;
+use std::ffi::OsString;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -15,6 +17,9 @@ use tar::{Builder, Header};
 /// Seconds since 1970, set where builds must be reproducible.
 const SOURCE_DATE: &str = "SOURCE_DATE_EPOCH";
 const ROOT: &str = "../..";
+/// The Python package and what an installed one holds beside its modules.
+const PACKAGE: &str = "env-server/rever_env";
+const ASSETS: &str = "env-server/assets";
 /// Files and folders that environment servers and the shipped policy are made of, as they are in a checkout.
 const CARRIED: [&str; 8] = [
     "env-server/assets",
@@ -35,7 +40,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo::rustc-env=REVER_COMMIT={}", commit());
     println!("cargo::rustc-env=REVER_BUILD_DATE={}", date());
     println!("cargo::rustc-env=REVER_FILES_DIGEST={}", pack()?);
-    Ok(())
+    lay_out_package()
 }
 
 /// The commit, with `-dirty` where files differ from it; empty outside of a checkout.
@@ -67,13 +72,43 @@ fn pack() -> Result<String, Box<dyn Error>> {
     Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
+/// Copies the package to where pyproject.toml takes it from.
+fn lay_out_package() -> Result<(), Box<dyn Error>> {
+    let package = PathBuf::from(std::env::var("OUT_DIR")?).join("rever_env");
+    // Files that are gone must not stay in the wheel.
+    if package.exists() {
+        std::fs::remove_dir_all(&package)?;
+    }
+    copy(&Path::new(ROOT).join(PACKAGE), &package)?;
+    copy(&Path::new(ROOT).join(ASSETS), &package.join("assets"))
+}
+
+fn copy(from: &Path, to: &Path) -> Result<(), Box<dyn Error>> {
+    std::fs::create_dir_all(to)?;
+    for name in names_in(from)? {
+        let (from, to) = (from.join(&name), to.join(&name));
+        if from.is_dir() {
+            copy(&from, &to)?;
+        } else {
+            std::fs::copy(&from, &to)?;
+        }
+    }
+    Ok(())
+}
+
+/// In order, without what Python compiles.
+fn names_in(folder: &Path) -> Result<Vec<OsString>, Box<dyn Error>> {
+    let entries: Result<Vec<_>, _> = folder.read_dir()?.collect();
+    let mut names: Vec<_> = entries?.into_iter().map(|entry| entry.file_name()).collect();
+    names.retain(|name| name != "__pycache__");
+    names.sort();
+    Ok(names)
+}
+
 fn append(archive: &mut Builder<GzEncoder<File>>, place: &Path) -> Result<(), Box<dyn Error>> {
     let path = Path::new(ROOT).join(place);
     if path.is_dir() {
-        let entries: Result<Vec<_>, _> = path.read_dir()?.collect();
-        let mut names: Vec<_> = entries?.into_iter().map(|entry| entry.file_name()).collect();
-        names.sort();
-        for name in names.iter().filter(|name| *name != "__pycache__") {
+        for name in names_in(&path)? {
             append(archive, &place.join(name))?;
         }
         return Ok(());

@@ -1,4 +1,4 @@
-"""Robot environments for Gymnasium: four Bridge tasks on MuJoCo, and environments behind servers.
+"""Robot manipulation environments for Gymnasium: four Bridge tasks in MuJoCo, and remote servers.
 
     import gymnasium
 
@@ -7,11 +7,13 @@
     action = environment.action_space.sample()  # metres, radians, gripper
     observation, reward, terminated, truncated, info = environment.step(action)
 
-Ids: rever/SpoonOnTowel-v1, rever/CarrotOnPlate-v1, rever/StackCube-v1, rever/EggplantInBasket-v1
-(BridgeEnv), and rever/Remote-v1 with connect="tcp/HOST:PORT" for a server that was started with
-`python -m rever_env serve --listen tcp/HOST:PORT` (RemoteEnv; RemoteVectorEnv for many at once).
+Gymnasium ids:
+    rever/SpoonOnTowel-v1, rever/CarrotOnPlate-v1, rever/StackCube-v1, rever/EggplantInBasket-v1:
+        BridgeEnv, which documents spaces, reward, end of episodes, info and errors.
+    rever/Remote-v1 with connect="tcp/HOST:PORT": RemoteEnv, an environment of a server that was
+        started with `python -m rever_env serve --listen tcp/HOST:PORT`. RemoteVectorEnv steps many.
 
-Modules, in the order of the data:
+Modules, in the order of the data flow:
 tasks.toml -> tasks -> layout -> world (controller, success, camera, snapshot)
 world -> expert -> reasoning -> demonstrations; world -> gymnasium_env
 world, robosuite_world, gymnasium_world -> worlds -> session -> server
@@ -40,7 +42,7 @@ __all__ = [
     "RemoteVectorEnv",
     "RemoteVectorFault",
 ]
-# Loaded when asked for: a server needs no client, and a client no simulator.
+# Imported on first access: a server needs no client, and a client no simulator.
 _MODULES = {
     "BridgeEnv": "gymnasium_env",
     "RemoteEnv": "remote",
@@ -50,14 +52,14 @@ _MODULES = {
     "RemoteVectorFault": "remote_vector",
 }
 
-# Importing MuJoCo with its default backend needs a display. The worlds make their own contexts.
+# Importing MuJoCo with its default backend needs a display. The worlds create their own contexts.
 _HAS_DISPLAY = bool(os.environ.get("DISPLAY"))
 _CAN_USE_EGL = os.environ.get("PYOPENGL_PLATFORM", "egl") == "egl"
 if sys.platform == "linux" and _CAN_USE_EGL and not _HAS_DISPLAY:
     os.environ.setdefault("MUJOCO_GL", "egl")
-# Mesa's software renderer draws in the thread that asks: handing a small picture to threads of its
-# own takes as long as drawing it, servers share a machine by processes, and threads do not live on
-# in a process that is forked, as Gymnasium's asynchronous vectors are.
+# No worker threads in Mesa's software renderer: handing a small image to them takes as long as
+# rendering it, servers use the cores by processes, and threads do not survive a fork, which
+# Gymnasium's asynchronous vectors need.
 os.environ.setdefault("LP_NUM_THREADS", "0")
 registration.register()
 

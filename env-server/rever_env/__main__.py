@@ -14,7 +14,7 @@ def main() -> int:
     arguments = _parser().parse_args()
     for warning in opengl.isolate_process():
         print(f"warning: {warning}", file=sys.stderr)
-    os.environ["SDL_VIDEODRIVER"] = "dummy"  # Gymnasium's own images need no screen
+    os.environ["SDL_VIDEODRIVER"] = "dummy"  # pygame renders Gymnasium's own images offscreen
     from rever_env.fault import Fault
 
     try:
@@ -33,11 +33,16 @@ def main() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="rever_env", description="The Bridge tasks in MuJoCo, and servers of any simulator."
+        prog="python -m rever_env",
+        description="Serve environments, record expert demonstrations, and measure both.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    expert = commands.add_parser("expert", help="measure the success rate of the scripted expert")
+    def add(name: str, purpose: str) -> argparse.ArgumentParser:
+        description = f"{purpose[0].upper()}{purpose[1:]}."
+        return commands.add_parser(name, help=purpose, description=description)
+
+    expert = add("expert", "measure the success rate of the scripted expert")
     _add_tasks(expert)
     expert.add_argument(
         "--episodes", type=count, default=200, help="random layouts per task (default: 200)"
@@ -45,44 +50,68 @@ def _parser() -> argparse.ArgumentParser:
     expert.add_argument(
         "--seed", type=int, default=4_000_000_000, help="first seed (default: 4000000000)"
     )
-    expert.add_argument("--processes", type=count, default=2, help="in parallel (default: 2)")
+    expert.add_argument("--processes", type=count, default=2, help="worker processes (default: 2)")
     expert.add_argument(
         "--robosuite", action="store_true", help="run the tasks in robosuite instead of MuJoCo"
     )
     expert.set_defaults(run=_expert)
 
-    demonstrate = commands.add_parser("demonstrate", help="record expert episodes for training")
+    _add_demonstrate(add("demonstrate", "record expert episodes for training"))
+    serving.add_arguments(add("serve", "serve environments over zenoh"))
+    health.add_arguments(add("health", "check that servers answer"))
+    _add_trace(add("trace", "print states, flags and image hashes of episodes"))
+    _add_bench(add("bench", "measure the time of a control step with its image"))
+    return parser
+
+
+def _add_demonstrate(demonstrate: argparse.ArgumentParser) -> None:
     _add_tasks(demonstrate)
     demonstrate.add_argument("--episodes", type=count, required=True, help="episodes per task")
     demonstrate.add_argument("--seed", type=int, default=0, help="first seed (default: 0)")
     demonstrate.add_argument(
-        "--out", type=Path, required=True, metavar="FOLDER", help="where TASK/SEED.npz are written"
+        "--out", type=Path, required=True, metavar="FOLDER", help="write to FOLDER/TASK/SEED.npz"
     )
     demonstrate.add_argument(
-        "--noise", action="store_true", help="execute noisy actions; the labels stay the expert's"
+        "--noise",
+        action="store_true",
+        help="execute the expert's actions with noise; the labels stay noise-free",
     )
-    demonstrate.add_argument("--processes", type=count, default=2, help="in parallel (default: 2)")
+    demonstrate.add_argument(
+        "--processes", type=count, default=2, help="worker processes (default: 2)"
+    )
     demonstrate.set_defaults(run=_demonstrate)
 
-    serve = commands.add_parser("serve", help="serve environments over zenoh")
-    serving.add_arguments(serve)
 
-    check = commands.add_parser("health", help="check that servers answer")
-    health.add_arguments(check)
-
-    trace = commands.add_parser("trace", help="print states, flags and image hashes of episodes")
+def _add_trace(trace: argparse.ArgumentParser) -> None:
     _add_tasks(trace)
     trace.add_argument(
-        "--layouts", nargs="+", type=int, help="fixed layouts (default: drawn from the seeds)"
+        "--layouts",
+        nargs="+",
+        type=int,
+        metavar="LAYOUT",
+        help="fixed initial layouts (default: random ones, drawn from the seeds)",
     )
-    trace.add_argument("--seeds", nargs="+", type=int, default=[0], help="default: 0")
-    trace.add_argument("--side", type=count, default=128, help="pixels per image side")
     trace.add_argument(
-        "--actions", type=Path, metavar="FILE", help="7 numbers per line (default: the expert's)"
+        "--seeds",
+        nargs="+",
+        type=int,
+        default=[0],
+        metavar="SEED",
+        help="one episode for each seed (default: 0)",
+    )
+    trace.add_argument(
+        "--side", type=count, default=128, help="pixels per image side (default: 128)"
+    )
+    trace.add_argument(
+        "--actions",
+        type=Path,
+        metavar="FILE",
+        help="execute these actions, 7 numbers per line (default: the scripted expert's)",
     )
     trace.set_defaults(run=_trace)
 
-    times = commands.add_parser("bench", help="measure the time of a control step with its image")
+
+def _add_bench(times: argparse.ArgumentParser) -> None:
     _add_tasks(times)
     times.add_argument(
         "--steps", type=count, default=200, help="steps per task and kind (default: 200)"
@@ -91,11 +120,10 @@ def _parser() -> argparse.ArgumentParser:
         "--side", type=count, default=224, help="pixels per image side (default: 224)"
     )
     times.add_argument(
-        "--robosuite", action="store_true", help="compare with robosuite's Stack and a Panda"
+        "--robosuite", action="store_true", help="also measure robosuite's Stack with a Panda"
     )
     times.add_argument("--json", type=Path, metavar="FILE", help="also write the results to a file")
     times.set_defaults(run=_bench)
-    return parser
 
 
 def _add_tasks(parser: argparse.ArgumentParser) -> None:

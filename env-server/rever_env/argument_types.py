@@ -1,4 +1,4 @@
-"""Types of command-line arguments, which refuse a value in words."""
+"""Types of command-line arguments: each parses a value or says what was expected."""
 
 import argparse
 import json
@@ -9,14 +9,14 @@ from rever_env.protocol import Keys, limits
 
 
 def count(text: str) -> int:
-    """A whole number from 1."""
+    """A positive whole number."""
     if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1, got {text}")
+        raise argparse.ArgumentTypeError(f"expected a positive whole number, got {text}")
     return int(text)
 
 
 def json_object(text: str) -> dict[str, Any]:
-    """An object in JSON."""
+    """A JSON object."""
     try:
         value = json.loads(text)
     except ValueError as error:
@@ -27,7 +27,7 @@ def json_object(text: str) -> dict[str, Any]:
 
 
 def endpoint(text: str) -> str:
-    """An endpoint of zenoh; HOST:PORT is tcp/HOST:PORT."""
+    """A zenoh endpoint; HOST:PORT means tcp/HOST:PORT."""
     try:
         return endpoints.checked(text)
     except ValueError as error:
@@ -35,7 +35,7 @@ def endpoint(text: str) -> str:
 
 
 def fleet(text: str) -> str:
-    """A name that may stand in keys."""
+    """A name that is valid in zenoh keys."""
     try:
         Keys(text)
     except ValueError as error:
@@ -44,7 +44,7 @@ def fleet(text: str) -> str:
 
 
 def session_count(text: str) -> int:
-    """As many sessions as the protocol has room for."""
+    """A number of sessions that the protocol allows."""
     if not text.isdecimal() or not 1 <= int(text) <= limits.SESSIONS_MAX:
         raise argparse.ArgumentTypeError(f"expected 1 to {limits.SESSIONS_MAX}, got {text}")
     return int(text)

@@ -1,4 +1,4 @@
-"""What users pass to environments, checked in one place for local and remote ones."""
+"""Arguments of environments: the same checks for local and remote ones."""
 
 import operator
 from typing import Any
@@ -11,7 +11,7 @@ from rever_env.protocol import limits
 
 
 def layout_of(options: dict[str, Any] | None) -> int | None:
-    """The fixed initial layout that reset's options ask for; ValueError for any other option."""
+    """The fixed initial layout in the options of reset(); ValueError for any other option."""
     options = options or {}
     unknown = set(options) - {"layout"}
     if unknown:
@@ -23,12 +23,12 @@ def layout_of(options: dict[str, Any] | None) -> int | None:
 
 
 def seed_of(seed: Any) -> int | None:
-    """The seed as a Python integer, of numpy's integers too; ValueError beyond the protocol's."""
+    """The seed as an int, also from a numpy integer; ValueError outside the protocol's range."""
     return None if seed is None else _whole("seed", seed, limits.SEED_END - 1)
 
 
 def image_size(height: Any, width: Any) -> tuple[int, int]:
-    """Height and width in pixels; both are 0 where no image is wanted."""
+    """Height and width in pixels; both are 0 for no image."""
     sides = (
         _whole("image_height", height, limits.IMAGE_SIDE_MAX),
         _whole("image_width", width, limits.IMAGE_SIDE_MAX),
@@ -41,22 +41,22 @@ def image_size(height: Any, width: Any) -> tuple[int, int]:
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """ValueError for a mode that these environments do not have."""
+    """ValueError for a render mode that these environments do not support."""
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render mode: expected None or 'rgb_array', got {render_mode!r}")
 
 
 def action_numbers(space: spaces.Space[Any], action: Any) -> NDArray[np.float32]:
-    """The action as float32; ValueError for the wrong shape or numbers that are not finite.
+    """The action as float32; ValueError for a wrong shape or numbers that are not finite.
 
-    Larger numbers than the space has are allowed: the environment decides what they do.
+    Numbers outside the bounds of the space are allowed: the environment decides what they do.
     """
     array = np.asarray(action)
     if array.dtype.kind not in "fiub":
         raise ValueError(f"action: expected numbers, got {action!r}")
     if array.shape != space.shape:
         raise ValueError(f"action: expected shape {space.shape}, got {array.shape}")
-    with np.errstate(over="ignore"):  # what does not fit into 32 bits is infinite below
+    with np.errstate(over="ignore"):  # overflow gives infinity, which is refused below
         numbers = array.astype(np.float32)
     if not np.isfinite(numbers).all():
         raise ValueError(f"action: expected finite numbers, got {array.tolist()}")

@@ -1,6 +1,6 @@
-"""The bench subcommand: a control step with its image, beside what it is made of, and robosuite's.
+"""The bench subcommand: time of a control step with its image, compared with bare MuJoCo calls.
 
-Blocks of steps are taken in turns, so that a machine that slows down slows all of them down.
+Blocks of steps alternate between the sides, so that a change of the machine's speed affects all.
 """
 
 import json
@@ -20,13 +20,13 @@ from rever_env import mjcf
 from rever_env.tasks import Task
 from rever_env.world import World
 
-_BLOCK = 10  # steps in a row of one kind, and one before them that finds the caches empty
+_BLOCK = 10  # consecutive steps of one kind, after one that warms the caches
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _CONTROL_HZ = 5
 _ROBOSUITE = "robosuite's Stack, Panda"
-_STACK = "widowx_stack_cube"  # what robosuite's task is most like
+_STACK = "widowx_stack_cube"  # the Bridge task that is most like robosuite's Stack
 
-Block = Callable[[], list[float]]  # runs _BLOCK + 1 steps; seconds of each
+Block = Callable[[], list[float]]  # runs _BLOCK + 1 steps, returns the seconds of each
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Row:
 def bench(
     tasks: list[Task], side: int, steps: int, *, with_robosuite: bool, file: Path | None
 ) -> int:
-    """Prints a table and the ratios of medians; writes them into the file, too."""
+    """Prints a table and the ratios of medians, and writes them to the file; returns the status."""
     if steps < _BLOCK or side < 1:
         print(
             f"error: expected at least {_BLOCK} steps and 1 pixel, got {steps} and {side}",
@@ -75,7 +75,7 @@ def bench(
 
 
 def _commit() -> str:
-    """What was measured: the checkout's commit, -dirty when something in it differs."""
+    """The commit of the checkout, with -dirty for uncommitted changes."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
     folder = Path(__file__).resolve().parent
     try:
@@ -86,7 +86,7 @@ def _commit() -> str:
 
 
 def measure(tasks: list[Task], side: int, steps: int, other: Block | None = None) -> list[Row]:
-    """Per task a step of the world, the same as bare MuJoCo calls, and the other simulator's."""
+    """Times of each task: a step of World, the same as bare MuJoCo calls, the other simulator."""
     rows = []
     for task in tasks:
         with World(task, side, side) as world:
@@ -96,7 +96,7 @@ def measure(tasks: list[Task], side: int, steps: int, other: Block | None = None
             others: list[float] = []
             for index in range(1 + steps // _BLOCK):
                 seconds = (blocks.world(), blocks.bare(), other() if other else [])
-                if index > 0:  # in the first one shaders compile
+                if index > 0:  # shaders compile in the first block
                     for times, more in zip((ours, bare, others), seconds, strict=True):
                         times.extend(more[1:])
             blocks.close()
@@ -107,13 +107,13 @@ def measure(tasks: list[Task], side: int, steps: int, other: Block | None = None
 
 
 class _Blocks:
-    """The expert at work, and the same states again without anything of ours."""
+    """Steps of World with the expert's actions, and the same states with bare MuJoCo calls."""
 
     def __init__(self, world: World, side: int) -> None:
         self._world = world
         self._substeps = world.task.settings.substeps
         self._camera = world.task.settings.camera
-        # A model of its own: the camera hides shapes of the world's.
+        # A second model, because the world's camera hides shapes of the first.
         self._model = mjcf.compile(world.task)
         self._spare = mujoco.MjData(self._model)
         self._renderer = mujoco.Renderer(self._model, side, side)
@@ -123,7 +123,7 @@ class _Blocks:
         self._states: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
 
     def world(self) -> list[float]:
-        """Control steps of the world."""
+        """Seconds of control steps of World."""
         world = self._world
         self._states.clear()
         seconds = []
@@ -141,7 +141,7 @@ class _Blocks:
         return seconds
 
     def bare(self) -> list[float]:
-        """The same physics and the same picture by MuJoCo's own calls."""
+        """Seconds of the same physics and the same image with MuJoCo's own calls."""
         model, data = self._model, self._spare
         seconds = []
         for state, control in self._states:
@@ -178,7 +178,7 @@ def _robosuite(side: int) -> Block:
     low, high = environment.action_spec
 
     def block() -> list[float]:
-        # robosuite draws into the current context, which MuJoCo's renderer has changed.
+        # robosuite renders into the current context, and MuJoCo's renderer has changed that.
         environment.sim._render_context_offscreen.gl_ctx.make_current()
         seconds = []
         for _ in range(_BLOCK + 1):
@@ -197,9 +197,10 @@ def _row(what: str, seconds: list[float]) -> Row:
 
 
 def _ratios(rows: list[Row]) -> dict[str, float]:
-    """ratio_bare: bare calls over ours, mean of the tasks; ratio_robosuite: robosuite over ours.
+    """Ratios of median times.
 
-    ratio_robosuite_stack: its task over our own of that kind. What is compared was taken in turns.
+    ratio_bare: bare MuJoCo calls / World, mean over the tasks. ratio_robosuite: robosuite / World.
+    ratio_robosuite_stack: robosuite's Stack / the Bridge task that stacks.
     """
     p50_ms = {row.what: row.p50_ms for row in rows}
     tasks = [what for what in p50_ms if "," not in what]

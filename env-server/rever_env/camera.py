@@ -22,8 +22,8 @@ _EDGE_MARGIN = 1e-3  # metres, for rounding errors of OpenGL
 class Camera:
     """Renders one fixed camera; the model, not the image's shape, sets its field of view.
 
-    With 0 x 0 pixels it renders nothing, and needs no OpenGL. Any thread may use it, one at a time:
-    its OpenGL context is current only while it draws.
+    With 0 x 0 pixels it renders nothing and needs no OpenGL. Any thread may use it, one at a time:
+    its OpenGL context is current only while it renders.
     """
 
     def __init__(self, model: mujoco.MjModel, name: str, height: int, width: int) -> None:
@@ -50,7 +50,7 @@ class Camera:
             ) from error
         self._context, self._renderer = context, renderer
         self._release = weakref.finalize(self, _release, context, renderer)
-        # Not at exit: the process frees it anyway, and MuJoCo may have closed the display before.
+        # Not at exit: the process frees it anyway, and MuJoCo may have closed the display already.
         self._release.atexit = False
         self._scene = mujoco.MjvScene(model, maxgeom=_GEOMS_MAX)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
@@ -72,7 +72,7 @@ class Camera:
             return self._read()
 
     def bodies(self, data: mujoco.MjData) -> NDArray[np.int32]:
-        """Body id seen at each pixel, int32 (height, width); -1 where the background is."""
+        """Body id at each pixel, int32 (height, width); -1 for the background."""
         flags = self._scene.flags
         with self._context.current():
             self._update(data)

@@ -1,4 +1,4 @@
-"""The controller: end-effector delta target with inverse kinematics, as in SIMPLER."""
+"""End-effector delta controller with inverse kinematics, as in SIMPLER."""
 
 import mujoco
 import numpy as np
@@ -12,8 +12,8 @@ Vector = NDArray[np.float64]
 class Controller:
     """Turns actions into joint targets; its state is the commanded pose of the tool centre point.
 
-    Only MuJoCo's own functions and element-wise arithmetic are used, in a fixed order, so that
-    another language linked to the same library computes the same bits.
+    Only MuJoCo's functions and element-wise arithmetic in a fixed order are used, so that another
+    language with the same library computes the same bits.
     """
 
     def __init__(self, model: mujoco.MjModel, task: Task) -> None:
@@ -29,7 +29,7 @@ class Controller:
         self._base = model.body(task.settings.robot_body).id
         damping = task.inverse_kinematics.damping
         self._damping = damping * damping * np.eye(len(joints))
-        # Making an array costs more than filling it. The first three are views.
+        # Allocated once: allocation costs more than filling. The first three are views.
         self._joints: Vector = self._scratch.qpos[self._positions]
         self._site_position = self._scratch.site_xpos[self._site]
         self._site_axes = self._scratch.site_xmat[self._site]
@@ -40,11 +40,11 @@ class Controller:
         self.quaternion: Vector = np.array([1.0, 0.0, 0.0, 0.0])
 
     def reset(self, data: mujoco.MjData) -> None:
-        """The commanded pose starts at the measured one."""
+        """Sets the commanded pose to the measured pose."""
         self.position, self.quaternion = self.measured(data)
 
     def measured(self, data: mujoco.MjData) -> tuple[Vector, Vector]:
-        """Tool centre point now, world frame: position (3,) and quaternion wxyz (4,)."""
+        """Measured tool centre point, world frame: position (3,) and quaternion wxyz (4,)."""
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, data.site_xmat[self._site])
         return data.site_xpos[self._site].copy(), quaternion
@@ -52,7 +52,7 @@ class Controller:
     def joint_target(self, data: mujoco.MjData, action: Vector) -> Vector:
         """Moves the commanded pose by the action and returns arm joint targets, (6,) rad.
 
-        The translation is in the base frame; the rotation vector is too, about the current
+        Translation and rotation vector are in the base frame; the rotation is about the measured
         tool centre point: p = p_now + dp + dR (p_commanded - p_now), R = dR R_commanded.
         """
         base_quaternion = data.xquat[self._base]
@@ -75,7 +75,7 @@ class Controller:
         return self._solve(data)
 
     def _solve(self, data: mujoco.MjData) -> Vector:
-        """Damped least squares from the measured joints; unreachable targets keep the measured."""
+        """Damped least squares from the measured joints; an unreachable target keeps those."""
         settings = self._task.inverse_kinematics
         scratch, joints, jacobian = self._scratch, self._joints, self._jacobian
         scratch.qpos[:] = data.qpos
@@ -104,7 +104,7 @@ class Controller:
         return found
 
     def _miss(self) -> float:
-        """Norm of the residual, which is filled: commanded minus scratch pose in the world frame.
+        """Fills the residual and returns its norm: commanded minus scratch pose, world frame.
 
         Metres (3) and rotation vector in rad (3).
         """
@@ -119,7 +119,7 @@ class Controller:
 
 
 def consecutive(indices: list[int]) -> slice:
-    """The slice of indices that follow one another: it gives a view where a list gives a copy."""
+    """Consecutive indices as a slice: a slice gives a view where a list gives a copy."""
     first, end = int(indices[0]), int(indices[-1]) + 1
     assert indices == list(range(first, end)), f"expected {first} to {end - 1}, got {indices}"
     return slice(first, end)

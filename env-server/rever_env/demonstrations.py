@@ -1,4 +1,4 @@
-"""Demonstrations: expert episodes with reasoning, one .npz file each."""
+"""Demonstrations: episodes of the expert with reasoning, one .npz file each."""
 
 import os
 import time
@@ -17,21 +17,21 @@ from rever_env.expert import Decision
 from rever_env.tasks import Task
 from rever_env.world import Observation, World
 
-SETTLE_STEPS = 6  # steps recorded after the object was released on its target
+SETTLE_STEPS = 6  # steps recorded after the release of the object on its target
 _NOISE_POSITION = 0.005  # metres, stationary standard deviation
 _NOISE_YAW = 0.04  # rad
 _NOISE_REVERSION = 0.3  # per step
 _NOISE_FINE = 0.3  # share of the noise in fine phases
-_SLIP_CHANCE = 0.010  # per step of reaching: the gripper closes by mistake
+_SLIP_CHANCE = 0.010  # probability per step of reaching that the gripper closes by mistake
 _SLIP_STEPS = 3
-_PUSH_CHANCE = 0.015  # per step: an excursion
+_PUSH_CHANCE = 0.015  # probability per step that an excursion begins
 _PUSH_STEPS = 3
 _PUSH_SIZE = 0.015  # metres per step
 _REPORT_SECONDS = 2.0
 
 
 class Noise:
-    """Ornstein-Uhlenbeck noise on the action, with rare excursions and gripper mistakes."""
+    """Ornstein-Uhlenbeck noise on the action, with rare excursions and false grasps."""
 
     def __init__(self, seed: int, task: Task) -> None:
         self._generator = np.random.Generator(np.random.PCG64([seed, task.index]))
@@ -41,7 +41,7 @@ class Noise:
         self._push = np.zeros(3)
 
     def apply(self, decision: Decision) -> NDArray[np.float64]:
-        """The action that is executed in place of the expert's."""
+        """The noisy action that replaces the expert's."""
         generator = self._generator
         scale = np.array([_NOISE_POSITION] * 3 + [_NOISE_YAW])
         kick = scale * np.sqrt(2.0 * _NOISE_REVERSION) * generator.standard_normal(4)
@@ -56,7 +56,7 @@ class Noise:
             self._slip_steps = _SLIP_STEPS
         if chances[1] < _PUSH_CHANCE and decision.subtask in ("reach", "move"):
             self._push_steps = _PUSH_STEPS
-            direction[2] = abs(direction[2])  # never into the table
+            direction[2] = abs(direction[2])  # the gripper must not hit the table
             self._push = _PUSH_SIZE * direction / np.linalg.norm(direction)
         if self._slip_steps > 0:
             self._slip_steps -= 1
@@ -69,7 +69,7 @@ class Noise:
 
 @dataclass
 class Annotator:
-    """Writes the reasoning of a step; keeps the last boxes of objects that are hidden."""
+    """Composes the reasoning of a step; remembers the last visible box of each object."""
 
     world: World
     boxes: list[reasoning.Box | None]
@@ -83,7 +83,7 @@ class Annotator:
         bodies = world.camera.bodies(world.data)
         for index, name in enumerate((world.task.source, world.task.target)):
             box = reasoning.visible_box(bodies, world.model.body(name).id)
-            # A hidden object keeps its last visible box; one never seen is a point.
+            # A hidden object keeps its last visible box; one that was never visible is a point.
             if box is None and self.boxes[index] is None:
                 pixel = self._pixel(world.data.body(name).xpos)
                 box = (*pixel, *pixel)
@@ -99,7 +99,11 @@ class Annotator:
 
 
 def record(world: World, seed: int, noisy: bool) -> dict[str, Any] | None:
-    """One episode as arrays; None when the expert failed."""
+    """One episode as arrays; None if the expert failed.
+
+    For T steps: image uint8 (T, height, width, 3), state float32 (T, 8), expert_action float32
+    (T, 7) without noise, reasoning str (T,). Also instruction, task, variant, seed and success.
+    """
     observation = world.reset(layout=None, seed=seed)
     noise = Noise(seed, world.task)
     annotator = Annotator.begin(world)
@@ -136,7 +140,7 @@ def record(world: World, seed: int, noisy: bool) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Share:
-    """The episodes of one process: every stride-th, starting at an offset."""
+    """The episodes of one process: every stride-th one from an offset."""
 
     tasks: tuple[Task, ...]
     episodes: int
@@ -148,19 +152,19 @@ class Share:
 
 
 def folder(out: Path, task: Task) -> Path:
-    """The folder of a task's episodes: TASK, or TASK@VARIANT for another than the default one."""
+    """The folder of a task's episodes: TASK, or TASK@VARIANT unless it is the default variant."""
     return out / str(task.id).replace("/", "@")
 
 
 def record_share(share: Share) -> dict[str, tuple[int, int]]:
-    """Records missing episodes; returns kept and failed episodes per task.
+    """Records the missing episodes; returns the numbers of kept and failed ones per task.
 
     A failed episode leaves an empty .failed file, so that a resumed run does not repeat it.
     """
     counts = {str(task.id): [0, 0] for task in share.tasks}
     worlds = [World(task) for task in share.tasks]
     try:
-        # Tasks alternate, so that an interrupted run has as many episodes of each.
+        # Tasks alternate, so that an interrupted run has equally many episodes of each.
         for index in range(share.offset, share.episodes, share.stride):
             for world in worlds:
                 seed = share.seed + index
@@ -195,7 +199,10 @@ def demonstrate(
     processes: int,
     report: Callable[[str], None],
 ) -> dict[str, tuple[int, int]]:
-    """Records episodes of every task with seeds from seed on; existing files are kept."""
+    """Records episodes of every task with the seeds from `seed` on; skips existing files.
+
+    report: receives progress lines. Returns the numbers of kept and failed episodes per task.
+    """
     for task in tasks:
         folder(out, task).mkdir(parents=True, exist_ok=True)
     shares = [
@@ -206,7 +213,7 @@ def demonstrate(
     total = episodes * len(tasks)
     seeds = range(seed, seed + episodes)
     before = _recorded(tasks, seeds, out)
-    # Not forked: other libraries' threads do not survive a fork.
+    # spawn: threads of other libraries do not survive a fork.
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(record_share, share) for share in shares]
         while not all(future.done() for future in futures):
@@ -214,7 +221,7 @@ def demonstrate(
             done = _recorded(tasks, seeds, out)
             seconds = time.monotonic() - started
             left = (total - done) * seconds / max(done - before, 1)
-            report(f"{done} of {total} episodes, {seconds:.0f} s, about {left:.0f} s left")
+            report(f"{done} of {total} episodes, {seconds:.0f} s, about {left:.0f} s remaining")
         results = [future.result() for future in futures]
     return {
         str(task.id): (
@@ -226,7 +233,7 @@ def demonstrate(
 
 
 def _recorded(tasks: list[Task], seeds: range, out: Path) -> int:
-    """How many of the episodes are recorded; the folder may contain other seeds."""
+    """The number of recorded episodes; the folder may hold other seeds, too."""
     return sum(
         entry.suffix in (".npz", ".failed") and entry.stem.isdecimal() and int(entry.stem) in seeds
         for task in tasks

@@ -1,4 +1,4 @@
-"""Endpoints of servers and routers: how they are written, and whether anything listens there."""
+"""Endpoints of servers and routers: their syntax, and whether they accept connections."""
 
 import re
 import socket
@@ -13,7 +13,7 @@ _ENDPOINT = re.compile(
 
 
 def checked(endpoint: str) -> str:
-    """The endpoint as zenoh writes it; HOST:PORT is tcp/HOST:PORT. ValueError for anything else."""
+    """The endpoint in zenoh's form; HOST:PORT means tcp/HOST:PORT. ValueError for other texts."""
     protocol, _, rest = str(endpoint).partition("/")
     if protocol in _PATHS and rest:
         return endpoint
@@ -28,7 +28,7 @@ def checked(endpoint: str) -> str:
 
 
 class Unreachable(OSError):
-    """Nothing can be reached at an endpoint; is_final: nor will it be later."""
+    """An endpoint cannot be reached. is_final: a retry is useless, as for an unknown host."""
 
     def __init__(self, words: str, *, is_final: bool = False) -> None:
         super().__init__(words)
@@ -36,7 +36,7 @@ class Unreachable(OSError):
 
 
 def reach(endpoint: str, timeout: float) -> None:
-    """Returns where something accepts connections, or where only zenoh can tell."""
+    """Returns if the endpoint accepts connections or only zenoh can try it; else Unreachable."""
     protocol, _, address = endpoint.partition("/")
     if protocol == "unixsock-stream":
         with socket.socket(socket.AF_UNIX) as connection:

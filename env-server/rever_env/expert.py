@@ -1,4 +1,4 @@
-"""The scripted expert: picks the source and puts it on the target, from the visible state alone."""
+"""The scripted expert: picks the source object and places it on the target, without memory."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from rever_env.tasks import Task
 
 Vector = NDArray[np.float64]
 
-GAIN = 0.6  # share of the remaining way that one action asks for
+GAIN = 0.6  # fraction of the remaining distance per action
 MOVE_MAX = 0.035  # metres per step
 TURN_MAX = 0.25  # rad per step
-SLOPE = 3.0  # metres of height allowed per metre of horizontal error: a funnel over the goal
-REACH_TOLERANCE = 0.005  # metres, horizontal, to begin the last descent
-CLOSE_TOLERANCE = 0.008  # to close an open gripper
-KEEP_CLOSING_TOLERANCE = 0.015  # to continue closing one that is visibly closing
-RISE_WHILE_CLOSING = 0.006  # metres per step, once the fingers are visibly on their way
-RISEN_MAX = 0.025  # metres above the grasp at which closed fingers have missed
+SLOPE = 3.0  # slope of the funnel over the goal: metres of height per metre of horizontal error
+REACH_TOLERANCE = 0.005  # horizontal tolerance for the last descent, metres
+CLOSE_TOLERANCE = 0.008  # tolerance for closing an open gripper
+KEEP_CLOSING_TOLERANCE = 0.015  # the same while it is visibly closing
+RISE_WHILE_CLOSING = 0.006  # metres per step while the fingers are visibly closing
+RISEN_MAX = 0.025  # metres above the grasp: fingers closed up there have missed
 PLACE_TOLERANCE = 0.006
 HEIGHT_TOLERANCE = 0.006
 TURN_TOLERANCE = 0.15  # rad
-METRES_PER_RADIAN = 0.04  # weighs a turn error against a horizontal one in the funnel
+METRES_PER_RADIAN = 0.04  # weight of the yaw error against the horizontal error in the funnel
 OPEN_MIN = 0.034  # finger joint position that counts as open, metres
 
 
@@ -43,13 +43,13 @@ class Stage(Protocol):
     @property
     def judge(self) -> Judge: ...
     def running_memory(self) -> Memory:
-        """The statistics' memory."""
+        """The memory of the episode statistics."""
         ...
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What the expert looks at; world frame, metres and radians."""
+    """The input of the expert; world frame, metres and radians."""
 
     tcp: Vector
     finger_angle: float  # heading of the finger axis
@@ -70,14 +70,14 @@ class Decision:
 
     action: Vector
     subtask: str  # one of SUBTASKS
-    fine: bool  # small errors matter now: injected noise is reduced
+    fine: bool  # a phase that needs precision: less noise is injected
 
 
 SUBTASKS = ("reach", "grasp", "lift", "move", "release", "done")
 
 
 def look(stage: Stage) -> Sight:
-    """Reads the sight from a running episode; changes nothing."""
+    """Reads the expert's input from a running episode; changes nothing."""
     model, data, task = stage.model, stage.data, stage.task
     memory = stage.running_memory()
     source, target = model.body(task.source).id, model.body(task.target).id
@@ -103,7 +103,7 @@ def look(stage: Stage) -> Sight:
 
 
 def decide(task: Task, sight: Sight) -> Decision:
-    """One decision; a pure function of the sight."""
+    """One decision: a pure function of the sight."""
     if sight.held:
         return _carry(task, sight)
     if sight.on_target:
@@ -114,8 +114,8 @@ def decide(task: Task, sight: Sight) -> Decision:
 def turn_error(task: Task, sight: Sight) -> float:
     """Angle from the finger axis to the source's short side, rad, by the source's symmetry.
 
-    The interval is lopsided (a third backwards, two thirds forwards), so that a source lying
-    across, where both ways are equally long, is always turned to the same way.
+    The interval is asymmetric (one third backwards, two thirds forwards), so that the expert always
+    turns the same way for a source that lies across, where both ways are equally long.
     """
     period = math.radians(task.grasp_symmetry)
     error = sight.source_angle + math.pi / 2.0 - sight.finger_angle
@@ -123,7 +123,7 @@ def turn_error(task: Task, sight: Sight) -> float:
 
 
 def _fetch(task: Task, sight: Sight) -> Decision:
-    """Goes over the source, down a funnel, and closes."""
+    """Moves above the source, descends through the funnel, and closes the gripper."""
     turned = _turned(task.grasp_offset, sight.source_angle)
     goal = sight.source + turned
     away = norm((goal - sight.tcp)[:2])
@@ -137,23 +137,23 @@ def _fetch(task: Task, sight: Sight) -> Decision:
         and -HEIGHT_TOLERANCE <= above <= risen_max
         and abs(turn) <= TURN_TOLERANCE
     ):
-        # Closing and closed fingers look alike in a small image. A label that hinged on the
-        # difference would leave a policy waiting with the source in its hand: both mean up.
+        # Closing and closed fingers look alike in a small image. If the label depended on the
+        # difference, a trained policy would wait with the source in its hand: both mean up.
         rise = 0.0 if is_open else RISE_WHILE_CLOSING / GAIN
         return _decision(sight, np.array([0.0, 0.0, rise]), 0.0, -1.0, "grasp", fine=True)
     error = max(away, METRES_PER_RADIAN * abs(turn))
     height = min(task.hover, SLOPE * max(0.0, error - REACH_TOLERANCE))
     if not is_open:
-        height = max(height, task.hover / 2.0)  # open again before coming down
+        height = max(height, task.hover / 2.0)  # open again before descending
     move = goal + np.array([0.0, 0.0, height]) - sight.tcp
-    # Below the funnel the fingers could sweep the source away: rise before going sideways.
+    # Below the funnel the fingers could push the source away: rise before moving sideways.
     low = max(0.0, height - above)
     move[:2] *= _fade(low, 0.015, 0.04)
     return _decision(sight, move, turn, 1.0, "reach", fine=error < 0.03)
 
 
 def _carry(task: Task, sight: Sight) -> Decision:
-    """Lifts, moves over the target, lowers down a funnel, and opens."""
+    """Lifts, moves above the target, descends through the funnel, and opens the gripper."""
     rest = sight.target_origin[2] + task.target_top + task.source_bottom
     place = rest + task.release_gap
     away = sight.target_centre[:2] - sight.source_centre[:2]
@@ -171,7 +171,7 @@ def _carry(task: Task, sight: Sight) -> Decision:
 
 
 def _leave(task: Task, sight: Sight) -> Decision:
-    """Opens fully, rises, and stays."""
+    """Opens the gripper fully, rises, and holds still."""
     if sight.finger_opening < OPEN_MIN:
         return _decision(sight, np.zeros(3), 0.0, 1.0, "release", fine=True)
     rise = sight.source[2] + task.hover - float(sight.tcp[2])
@@ -183,7 +183,7 @@ def _leave(task: Task, sight: Sight) -> Decision:
 def _decision(
     sight: Sight, move: Vector, turn: float, gripper: float, subtask: str, *, fine: bool
 ) -> Decision:
-    """Scales the remaining way to one action in the base frame. Roll and pitch stay zero."""
+    """Scales the remaining motion to one action in the base frame, without roll and pitch."""
     step = GAIN * move
     length = norm(step)
     if length > MOVE_MAX:
@@ -203,5 +203,5 @@ def _turned(offset: tuple[float, float, float], angle: float) -> Vector:
 
 
 def _fade(value: float, full: float, none: float) -> float:
-    """1 up to full, 0 from none on, linear between."""
+    """1 up to `full`, 0 from `none` on, linear in between."""
     return min(max((none - value) / (none - full), 0.0), 1.0)

@@ -1,8 +1,8 @@
-"""What can go wrong in the world: each fault is its own type and never a reward."""
+"""Faults of an environment: the episode has no outcome. A fault is never a reward."""
 
 
 class Fault(RuntimeError):
-    """The world cannot go on; the episode has no outcome."""
+    """The environment cannot continue; the episode has no outcome."""
 
 
 class PhysicsDiverged(Fault):
@@ -10,12 +10,12 @@ class PhysicsDiverged(Fault):
 
 
 class RendererUnavailable(Fault):
-    """No OpenGL context could be made."""
+    """No OpenGL context could be created."""
 
 
 class InvalidAction(Fault):
-    """The action has the wrong shape, is not finite, or comes when no step is allowed."""
+    """The action has the wrong shape or is not finite, or no step is allowed at this moment."""
 
 
 class InvalidReset(Fault):
-    """What is asked for is not there: a task, a layout, a seed, a free layout."""
+    """An unknown task, variant or layout, an invalid seed, or no free random layout."""

@@ -1,4 +1,4 @@
-"""Whether a gripper follows its actions, read from the states that a policy sees."""
+"""info["action_followed"]: whether the gripper follows its actions, from the observed states."""
 
 import math
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ Vector = NDArray[np.float64]
 
 _STATE = ("x", "y", "z", "roll", "pitch", "yaw")
 _ACTION = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
-# Of the way to the commanded pose that may be left after a step. The arm needs more than one step
-# for the largest actions; one that holds still, for its target is out of reach, leaves all of it.
+# Fraction of the way to the commanded pose that may remain after a step. The largest actions take
+# more than one step; an arm that holds still, because its target is out of reach, leaves all.
 _SHARE_LEFT_MAX = 0.7
 _METRES_LEFT_MAX = 0.005
 _RADIANS_LEFT_MAX = 0.03
 
 
 def is_pose_controlled(state: Sequence[Dimension], action: Sequence[Dimension]) -> bool:
-    """Whether state and action are Bridge's: the gripper's pose, and what it moves by."""
+    """Whether state and action are those of the Bridge tasks: a pose, and a change of it."""
     return (
         tuple(one.name for one in state[:6]) == _STATE
         and tuple(one.name for one in action[:6]) == _ACTION
@@ -30,18 +30,18 @@ def is_pose_controlled(state: Sequence[Dimension], action: Sequence[Dimension]) 
 class CommandedPose:
     """The pose that the actions of an episode add up to, in the base's frame.
 
-    The controller moves the commanded pose by each action and aims at it: position p + dp +
-    dR (p_commanded - p), attitude dR R_commanded. The next step goes on from there, so that a
-    target out of reach stays the target until actions bring it back.
+    The controller moves the commanded pose by each action and steers to it: position p + dp +
+    dR (p_commanded - p), attitude dR R_commanded. The next action starts from the commanded pose,
+    so that a pose out of reach remains the target until actions bring it back.
     """
 
     def __init__(self, state: NDArray[np.float32]) -> None:
-        """state: after reset, when nothing has been commanded yet."""
+        """state: the state after reset, before the first action."""
         self._measured, self._measured_attitude = _pose(state)
         self._position, self._attitude = self._measured, self._measured_attitude
 
     def follow(self, action: NDArray[np.float32], state: NDArray[np.float32]) -> bool:
-        """Whether the step with this action, which led to this state, followed it."""
+        """Whether the gripper followed this action in the step that led to this state."""
         numbers = action.astype(np.float64)
         turn = _turn(numbers[3:6])
         now = self._measured
@@ -56,7 +56,7 @@ class CommandedPose:
         )
 
     def _left(self) -> tuple[float, float]:
-        """Metres and radians from the measured pose to the commanded one."""
+        """Distance from the measured to the commanded pose in metres and radians."""
         offset = self._position - self._measured
         cosine = (float(np.sum(self._attitude * self._measured_attitude)) - 1.0) / 2.0
         return math.sqrt(float(offset @ offset)), math.acos(min(max(cosine, -1.0), 1.0))
@@ -72,7 +72,7 @@ def _pose(state: NDArray[np.float32]) -> tuple[Vector, Vector]:
 
 
 def _turn(vector: Vector) -> Vector:
-    """The rotation (3, 3) about a vector by its length in radians."""
+    """The rotation matrix (3, 3) of a rotation vector in radians."""
     angle = math.sqrt(float(vector @ vector))
     if angle == 0.0:
         return np.eye(3)

@@ -1,4 +1,4 @@
-"""The Gymnasium environments: one id per task, the same world behind each."""
+"""BridgeEnv: the four Bridge tasks as Gymnasium environments, one id per task."""
 
 from dataclasses import asdict
 from typing import Any
@@ -24,28 +24,54 @@ from rever_env.world import Observation, World
 
 
 class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]], EzPickle):
-    """One of the four Bridge tasks: a WidowX arm on a table, 5 control steps per second.
+    """One of SIMPLER's four Bridge tasks: a WidowX arm over a table, simulated in MuJoCo.
 
-    Arguments
-        task: SIMPLER's name. variant: one of the task's in tasks.toml.
-        image_height, image_width: pixels, 1 to 1024; 0 and 0 for no image.
+    Arguments:
+        task: SIMPLER's name of the task, such as "widowx_stack_cube".
+        variant: a variant of the task in assets/tasks.toml, such as "distractors".
+        render_mode: "rgb_array", or None for an environment whose render() returns None.
+        image_height, image_width: pixels, 1 to 1024 each; 0 and 0 for no image.
 
-    Observation: image uint8 (height, width, 3); state float32 (8,): x y z (m) roll pitch yaw (rad)
-    of the gripper in the base's frame, 0, gripper opening 0 to 1; instruction text.
-    Action: float32 (7,): dx dy dz (m), rotation vector (rad), both in the base's frame, gripper
-    (+1 open, -1 closed). The bounds of action_space are what the arm can do in one step; larger
-    actions are taken too. The arm holds still where the commanded pose is out of reach.
-    Reward: 1.0 at every step after which the task is solved, otherwise 0.0; a return counts steps.
-    Episodes never terminate, because SIMPLER judges the last step: they are truncated after 60
-    steps, or 120 (eggplant).
-    info of a step: is_success (now; the episode's result at its last step), ever_success,
-    released_success, is_grasped, ever_grasped, consecutive_grasp, moved_correct_object,
-    moved_wrong_object, source_on_target, and action_followed: False where the gripper came less
-    than 30 % of the way to its commanded pose, because that is out of reach or something blocks it.
+    Observation (dict):
+        image: uint8 (image_height, image_width, 3), RGB, rows from the top.
+        state: float32 (8,). x y z of the gripper in metres and its roll pitch yaw in radians, both
+            in the robot's base frame; 0; the opening of the gripper, 0 (closed) to 1 (open).
+        instruction: str, such as "stack the green block on the yellow block".
 
-    Raises rever_env.fault.Fault when the physics diverges or no image can be drawn, which is never
-    a reward, and its kind InvalidReset for a task, variant or layout that there is not; ValueError
-    for other invalid arguments, and gymnasium.error.ClosedEnvironmentError after close.
+    Action, float32 (7,): dx dy dz in metres and a rotation vector in radians, both in the base
+    frame, then the gripper (+1 open, -1 closed). The bounds of action_space, 0.05 m and 0.25 rad,
+    are what the arm can do in one step. Larger finite numbers are accepted. Actions add up to a
+    commanded pose; the arm holds still while that pose is out of reach.
+
+    Control rate: 5 steps per second of simulated time, 0.2 s each (metadata["render_fps"]).
+
+    Reward: 1.0 for every step after which the task is solved, otherwise 0.0. The return is the
+    number of such steps, so that it is not a success flag.
+
+    Termination: never, because SIMPLER judges the last step. Truncation: after 60 steps, or 120
+    for widowx_put_eggplant_in_basket.
+
+    Info of step(), all bool:
+        is_success: solved after this step. At the last step it is the episode's result.
+        ever_success: solved after this or an earlier step.
+        released_success: solved after this step, and the robot no longer touches the object.
+        is_grasped: both fingers press the source object after this step.
+        ever_grasped: is_grasped after this or an earlier step.
+        consecutive_grasp: is_grasped was true for five steps in a row at some time so far.
+        moved_correct_object: the source object has moved more than 3 cm and farther than any other.
+        moved_wrong_object: another object has moved more than 3 cm and farther than the source.
+        source_on_target: the source object lies on its target (here the same as is_success).
+        action_followed: False where the gripper covered less than 30 % of the way to its commanded
+            pose, because the pose is out of reach or something blocks the arm.
+    Info of reset(): seed, int.
+
+    Raises:
+        rever_env.fault.InvalidReset: unknown task, variant or layout.
+        rever_env.fault.Fault: the physics diverged, or no image can be rendered. The episode has no
+            outcome; reset() begins a new one.
+        ValueError: any other invalid argument, an action of the wrong shape or with a number that
+            is not finite.
+        gymnasium.error.ClosedEnvironmentError: used after close().
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
@@ -92,7 +118,7 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]], EzPickle):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One control step of 0.2 s: observation, reward, terminated, truncated, info."""
+        """Executes one control step of 0.2 s; see the class for what it returns."""
         self._require_open()
         numbers = action_numbers(self.action_space, action)
         transition = self.world.step(numbers.astype(np.float64))
@@ -109,13 +135,16 @@ class BridgeEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]], EzPickle):
         )
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A copy of the last observation's image; None before the first reset."""
+        """The image of the last observation, uint8 (height, width, 3), as a copy.
+
+        None before the first reset, without images, or with render_mode None.
+        """
         if self.render_mode is None or self._last is None:
             return None
         return np.array(self._last.image)
 
     def close(self) -> None:
-        """Frees the world; a second call does nothing."""
+        """Frees the simulation; a second call does nothing."""
         if not self._is_closed:
             self._is_closed = True
             self.world.close()

@@ -1,4 +1,4 @@
-"""What a Gymnasium environment offers, by its id: image, state, instruction, actions, limits."""
+"""Gymnasium environments as tasks of a server: image, state, instruction, actions, limits."""
 
 import dataclasses
 import importlib
@@ -18,7 +18,7 @@ from rever_env.space_parts import Part, dimensions_of, parts_of
 
 _log = logging.getLogger(__name__)
 
-# Where environments keep the instruction that is not in the observation, first come first served.
+# Attributes that may hold an instruction outside of the observation, in order of preference.
 _INSTRUCTION_ATTRIBUTES = (
     "task_description",
     "instruction",
@@ -29,23 +29,23 @@ _INSTRUCTION_ATTRIBUTES = (
 
 @dataclass(frozen=True)
 class Making:
-    """How an environment is made beside its id. wrapper: applied outermost."""
+    """Arguments of gymnasium.make beside the id, and the outermost wrapper."""
 
     arguments: Mapping[str, Any] = field(default_factory=dict)
     wrapper: Any = None
 
     def make(self, name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":
-        """InvalidReset when there is no such environment, or when it cannot be made like that."""
+        """A new environment; InvalidReset if the id is unknown or the environment fails."""
         try:
             environment = gymnasium.make(name, **self.arguments, **arguments)
             return environment if self.wrapper is None else self.wrapper(environment)
-        except Exception as error:  # the environment's own code raises errors of any type
+        except Exception as error:  # the environment's code may raise errors of any type
             raise InvalidReset(f"environment {name}: {type(error).__name__}: {error}") from error
 
 
 @dataclass(frozen=True)
 class Keys:
-    """Parts of the observation by name, as in `images.front`; None: chosen by their spaces."""
+    """Names of parts of the observation, such as `images.front`; None: chosen by their spaces."""
 
     image: str | None = None
     instruction: str | None = None
@@ -54,7 +54,7 @@ class Keys:
 
 @dataclass(frozen=True)
 class GymnasiumTask:
-    """An environment by its id; the rest is read from its spaces and its first reset."""
+    """An environment by its id; the other fields come from its spaces and its first reset."""
 
     name: str
     instruction: str  # of the first reset
@@ -62,7 +62,7 @@ class GymnasiumTask:
     state: tuple[Dimension, ...]
     action: tuple[Dimension, ...]
     state_parts: tuple[Part, ...]
-    image_part: Part | None  # None: the image is what the environment renders
+    image_part: Part | None  # None: the image comes from render()
     instruction_part: Part | None
     instruction_attribute: str | None
     renders: bool
@@ -70,15 +70,15 @@ class GymnasiumTask:
     control_hz: float | None  # render_fps of its metadata
     variant: str = "default"
     version: int = 1
-    layouts: tuple[()] = ()  # the seed draws every start
+    layouts: tuple[()] = ()  # the seed draws every initial state
 
     @property
     def has_image(self) -> bool:
-        """Whether there is an image at all."""
+        """Whether observations have an image."""
         return self.image_part is not None or self.renders
 
     def instruction_of(self, environment: "gymnasium.Env[Any, Any]", observation: Any) -> str:
-        """The instruction of this moment."""
+        """The present instruction."""
         if self.instruction_part is not None:
             return str(self.instruction_part.of(observation))
         said = _said(environment, self.instruction_attribute) if self.instruction_attribute else ""
@@ -92,9 +92,10 @@ def offered(
     horizon: int,
     keys: Keys | None = None,
 ) -> dict[str, GymnasiumTask]:
-    """Every named environment. imports: packages that register ids when they are imported.
+    """The named environments as tasks, by name.
 
-    horizon: steps of environments whose id has no limit.
+    imports: packages that register ids when they are imported. horizon: step limit of environments
+    whose id has none.
     """
     for package in imports:
         try:
@@ -114,13 +115,13 @@ def imported(path: str) -> Any:
 
 
 def has_limit(name: str) -> bool:
-    """Whether the id limits its episodes."""
+    """Whether the id has a step limit."""
     spec = gymnasium.registry.get(name)
     return spec is not None and spec.max_episode_steps is not None
 
 
 def simulator(imports: Iterable[str]) -> str:
-    """Gymnasium with its version, and the packages that the environments come from."""
+    """Names and versions of Gymnasium and of the packages that the environments come from."""
     names = ["gymnasium", *imports]
     return ", ".join(f"{name} {_version(name)}" for name in names)
 
@@ -143,7 +144,7 @@ def _task(name: str, making: Making, horizon: int, keys: Keys) -> GymnasiumTask:
             raise InvalidReset(f"environment {name}: expected actions of numbers, got none")
         try:
             observation, _ = environment.reset(seed=0)
-        except Exception as error:  # the same
+        except Exception as error:  # of any type, as above
             raise InvalidReset(
                 f"environment {name}: reset(seed=0) failed: {type(error).__name__}: {error}"
             ) from error
@@ -152,7 +153,7 @@ def _task(name: str, making: Making, horizon: int, keys: Keys) -> GymnasiumTask:
         steps_max = spec.max_episode_steps if spec else None
         if hasattr(environment.unwrapped, "compute_reward"):
             _log.warning(
-                "environment %s: its compute_reward cannot be called over the network: hindsight "
+                "environment %s: compute_reward cannot be called over the network; hindsight "
                 "relabelling needs the environment in the trainer's process",
                 name,
             )
@@ -177,7 +178,7 @@ def _task(name: str, making: Making, horizon: int, keys: Keys) -> GymnasiumTask:
 
 
 def _state_parts(parts: list[Part], names: tuple[str, ...] | None) -> tuple[Part, ...]:
-    """Every part of numbers, or those that are named, in that order."""
+    """All numeric parts, or the named ones in the given order."""
     numeric = [part for part in parts if not part.is_text and not part.is_image]
     if names is None:
         return tuple(numeric)
@@ -191,12 +192,12 @@ def _state_parts(parts: list[Part], names: tuple[str, ...] | None) -> tuple[Part
 
 
 def _image_part(name: str, parts: list[Part], key: str | None) -> Part | None:
-    """The image that is served: the named one or the first; the others are named in a warning."""
+    """The image to serve: the named one or the first; a warning names the others."""
     images = [part for part in parts if part.is_image]
     if key is None and len(images) > 1:
         _log.warning(
-            "environment %s: the image %s of its observation is served, and not %s; --image-key "
-            "chooses another one",
+            "environment %s: serving the image %s of its observation, not %s; choose another with "
+            "--image-key",
             name,
             images[0].name,
             _names(images[1:]),
@@ -205,12 +206,12 @@ def _image_part(name: str, parts: list[Part], key: str | None) -> Part | None:
 
 
 def _instruction_part(name: str, parts: list[Part], key: str | None) -> Part | None:
-    """The text that is served: the named one or the first."""
+    """The instruction to serve: the named text or the first; a warning names the others."""
     texts = [part for part in parts if part.is_text]
     if key is None and len(texts) > 1:
         _log.warning(
-            "environment %s: the text %s of its observation is the instruction, and not %s; "
-            "--instruction-key chooses another one",
+            "environment %s: serving the text %s of its observation as the instruction, not %s; "
+            "choose another one with --instruction-key",
             name,
             texts[0].name,
             _names(texts[1:]),
@@ -228,7 +229,7 @@ def _named(parts: list[Part], key: str | None, kind: str) -> Part | None:
 
 
 def _names(parts: list[Part]) -> str:
-    return ", ".join(part.name for part in parts) or "none: the observation has no such part"
+    return ", ".join(part.name for part in parts) or "none (the observation has no such part)"
 
 
 def _instruction_attribute(environment: "gymnasium.Env[Any, Any]") -> str | None:
@@ -239,7 +240,7 @@ def _instruction_attribute(environment: "gymnasium.Env[Any, Any]") -> str | None
 
 
 def _said(environment: "gymnasium.Env[Any, Any]", attribute: str) -> str:
-    """The text of an attribute or of a method without arguments; empty if it is none."""
+    """The text of an attribute or of a method without arguments; empty if there is none."""
     try:
         value = environment.get_wrapper_attr(attribute)
     except AttributeError:
@@ -247,12 +248,12 @@ def _said(environment: "gymnasium.Env[Any, Any]", attribute: str) -> str:
     if callable(value):
         value = value()
     if isinstance(value, (list, tuple)) and len(value) == 1:
-        value = value[0]  # of an environment that is a batch of one
+        value = value[0]  # an environment that is a batch of one
     return value if isinstance(value, str) else ""
 
 
 def _control_hz(render_fps: object) -> float | None:
-    """What the metadata say, if it is a rate."""
+    """render_fps of the metadata, if it is a valid rate."""
     if not isinstance(render_fps, (int, float, np.number)) or isinstance(render_fps, bool):
         return None
     rate = float(render_fps)
@@ -263,4 +264,4 @@ def _version(package: str) -> str:
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
-        return "of no version"
+        return "(unknown version)"

@@ -1,4 +1,4 @@
-"""Tries what is promised for a Gymnasium environment before it is served."""
+"""Checks a Gymnasium environment before it is served: determinism, first steps, rendering."""
 
 import dataclasses
 from contextlib import closing
@@ -16,7 +16,7 @@ _SIDE = 64  # pixels
 
 
 def tried(task: GymnasiumTask) -> tuple[GymnasiumTask, list[str]]:
-    """The task as it can be served, and warnings about what the environment does not keep."""
+    """The task as it can be served, and warnings about the checks that failed."""
     warnings = [f"environment {task.name}: {words}" for words in _broken_promises(task)]
     if task.image_part is None and task.renders:
         try:
@@ -29,7 +29,7 @@ def tried(task: GymnasiumTask) -> tuple[GymnasiumTask, list[str]]:
 
 
 def _broken_promises(task: GymnasiumTask) -> list[str]:
-    """Whether two episodes of one seed and the same actions differ, or its first steps fail."""
+    """Warnings if episodes with the same seed and actions differ, or if the first steps fail."""
     random = np.random.default_rng(0)
     actions = [
         np.array([_number(dimension, random) for dimension in task.action]) for _ in range(_STEPS)
@@ -45,18 +45,18 @@ def _broken_promises(task: GymnasiumTask) -> list[str]:
                 where = "another instance"
             elif _episode(one, actions) != expected:
                 where = "the next episode"
-    except Exception as error:  # the environment's own code raises what it likes
+    except Exception as error:  # the environment's code may raise errors of any type
         return [f"a reset and {_STEPS} random steps fail: {type(error).__name__}: {error}"]
     if where is None:
         return []
     return [
-        f"the same seed and actions give other observations in {where}: episodes cannot be "
-        "repeated, and restoring a saved state will be a fault"
+        f"the same seed and actions give different observations in {where}: episodes are not "
+        "reproducible, and restoring a saved state will fail"
     ]
 
 
 def _episode(world: GymnasiumWorld, actions: list[NDArray[np.float64]]) -> list[list[bytes]]:
-    """Everything that is observed until the actions or the episode end."""
+    """All observations and rewards until the actions or the episode end."""
     world.reset(layout=None, seed=0)
     seen = [world.seen()]
     for action in actions:
@@ -68,7 +68,7 @@ def _episode(world: GymnasiumWorld, actions: list[NDArray[np.float64]]) -> list[
 
 
 def _number(dimension: Dimension, random: np.random.Generator) -> float:
-    """Any number within the bounds."""
+    """A random number within the bounds."""
     low = -1.0 if dimension.low is None else dimension.low
     high = 1.0 if dimension.high is None else dimension.high
     if dimension.discrete:

@@ -1,4 +1,4 @@
-"""Any Gymnasium environment behind the protocol."""
+"""A Gymnasium environment as a world of a server."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,22 +24,22 @@ from rever_env.success import success_alone
 from rever_env.world import Observation, Transition, divergence, silence_warnings
 
 _SUCCESSES = ("is_success", "success")
-_SEED_END = 1 << 32  # numpy's older generators take no larger one
+_SEED_END = 1 << 32  # numpy's older generators accept no larger seed
 
 
 class NotReproducible(Fault):
-    """The same reset and actions led elsewhere: a saved state cannot be restored."""
+    """The same reset and actions led to another state: a saved state cannot be restored."""
 
 
 class GymnasiumWorld:
-    """One environment. Any thread may use it, if the environment allows it, one at a time.
+    """One environment. Any thread may use it, if the environment allows that, one at a time.
 
-    State: the numbers of the observation in the order of its space, or of the parts that were
-    named. Image: the first or the named one of the observation, otherwise what the environment
-    renders, resized. Instruction: see GymnasiumTask. Success: what info says (is_success or
-    success), otherwise a return that reaches the id's reward_threshold; without either no step is
-    a success. A saved state is the seed and the actions since: restoring repeats them, and is a
-    fault when the observation differs.
+    State: the numbers of the observation in the order of its space, or of the named parts. Image:
+    the first or the named one of the observation, otherwise what the environment renders; resized.
+    Instruction: see GymnasiumTask. Success: is_success or success of info, otherwise a return that
+    reaches the reward_threshold of the id; with neither, no step is a success. A saved state is the
+    seed and the actions since reset: restore repeats them, and is a fault if the observation
+    differs.
     """
 
     def __init__(self, task: GymnasiumTask, image_height: int, image_width: int) -> None:
@@ -64,12 +64,12 @@ class GymnasiumWorld:
         self._last: Any = None
 
     def reset(self, *, layout: int | None, seed: int) -> Observation:
-        """The same seed gives the same start, if the environment keeps Gymnasium's contract."""
+        """The same seed gives the same start, if the environment keeps to Gymnasium's API."""
         check_layout(self.task.name, layout, 0)
         return self._begin(seed)
 
     def step(self, action: NDArray[np.float64]) -> Transition:
-        """action: float64, as many numbers as the task describes."""
+        """Executes one control step. action: float64, as many numbers as the task describes."""
         self._running()
         if self._has_ended:
             raise InvalidAction(
@@ -91,11 +91,11 @@ class GymnasiumWorld:
         return seed, list(self._actions), self.seen()
 
     def restore(self, content: Any) -> Observation:
-        """Repeats the saved actions."""
+        """Resets with the saved seed and repeats the saved actions."""
         seed, actions, expected = content
         observation = self._begin(seed)
         for action in actions:
-            # Rendered as well, since some environments change their physics when they draw.
+            # Rendered as well, because rendering changes the physics of some environments.
             observation = self._advance(action)[0]
         if self.seen() != expected:
             self._start = None
@@ -106,7 +106,7 @@ class GymnasiumWorld:
         raise InvalidAction(f"task {self.task.name} has no scripted expert")
 
     def seen(self) -> list[bytes]:
-        """The whole observation, part by part."""
+        """The whole observation as bytes, part by part."""
         return [np.asarray(part.of(self._last)).tobytes() for part in self._parts]
 
     def close(self) -> None:
@@ -119,7 +119,7 @@ class GymnasiumWorld:
         self._return = 0.0
         if seed >= _SEED_END:
             seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
-        np.random.seed(seed)  # for environments that draw from numpy's global generator
+        np.random.seed(seed)  # for environments that use numpy's global generator
         with self._drawing():
             self._last, _ = self._environment.reset(seed=seed)
             return self._observe()
@@ -169,9 +169,9 @@ class GymnasiumWorld:
 
     @contextmanager
     def _drawing(self) -> Iterator[None]:
-        """Inside, the OpenGL context of a MuJoCo environment's viewer is current.
+        """Makes the OpenGL context of a MuJoCo environment's viewer current inside the block.
 
-        Gymnasium takes that for granted; afterwards this thread has the context it had before.
+        Gymnasium assumes that it is; afterwards this thread has its previous context again.
         """
         with opengl.preserved_context():
             renderer = getattr(self._environment.unwrapped, "mujoco_renderer", None)
@@ -203,10 +203,10 @@ class GymnasiumWorld:
         else:
             image = self._rendered()
         if image.shape[:2] == self._size:
-            return np.array(image, order="C")  # an environment may draw into the same array again
+            return np.array(image, order="C")  # a copy: the environment may reuse the array
         from PIL import Image
 
-        # Each new pixel is the mean of the area it covers: a small image must not lose thin things.
+        # Each new pixel is the mean of the area it covers, so that thin objects stay visible.
         resized = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
         return np.asarray(resized)
 
@@ -224,7 +224,7 @@ class GymnasiumWorld:
 
 
 def _make(task: GymnasiumTask, size: tuple[int, int]) -> "gymnasium.Env[Any, Any]":
-    """With images of that size where the environment lets it be chosen, of any size, or without."""
+    """A new environment, with images of this size where it accepts a size, or without images."""
     if size == (0, 0) or task.image_part is not None:
         return task.making.make(task.name)
     height, width = size

@@ -1,4 +1,4 @@
-"""The health subcommand: asks the servers that an endpoint leads to whether they still work."""
+"""The health subcommand: checks that the servers behind an endpoint answer."""
 
 import argparse
 import sys
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rever_env.argument_types import endpoint, fleet
 
-_ASK_SECS = 2.0  # one query; a link that has just been opened may not lead anywhere yet
+_ASK_SECS = 2.0  # timeout of one query; a new link may not lead to a server yet
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,33 +17,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=endpoint,
         metavar="ENDPOINT",
-        help="a server or a router, such as tcp/127.0.0.1:7448",
+        help="endpoint of a server or a router, such as tcp/127.0.0.1:7448",
     )
     parser.add_argument(
         "--fleet",
         type=fleet,
         default="local",
         metavar="NAME",
-        help="namespace: only servers of this fleet are asked (default: local)",
+        help="namespace: check only servers of this fleet (default: local)",
     )
     parser.add_argument(
         "--timeout-secs",
         type=float,
         default=5.0,
         metavar="SECONDS",
-        help="how long to wait for an answer (default: 5)",
+        help="timeout for an answer in seconds (default: 5)",
     )
     parser.add_argument(
         "--id-file",
         type=Path,
         metavar="FILE",
-        help="ask only the server that was started with this --id-file",
+        help="check only the server that was started with this --id-file",
     )
     parser.set_defaults(run=health)
 
 
 def health(arguments: argparse.Namespace) -> int:
-    """Prints one line per server that answers from its simulation thread; fails if none does."""
+    """Prints one line per server whose simulation thread answers; returns 1 if none does."""
     import zenoh
 
     from rever_env import protocol
@@ -69,7 +69,7 @@ def health(arguments: argparse.Namespace) -> int:
                 try:
                     server = protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes())
                 except protocol.CodecError as error:
-                    misread = f"; the description of one cannot be read: {error}"
+                    misread = f"; a server's description cannot be read: {error}"
                     continue
                 tasks = ", ".join(str(TaskId(task.task, task.variant)) for task in server.tasks)
                 print(

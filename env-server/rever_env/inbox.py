@@ -1,7 +1,6 @@
-"""What waits for the simulation thread: bounded for each session, and taken from each in turn.
+"""Queues of work for the simulation thread: bounded per session and served round-robin.
 
-zenoh's threads only put, and never wait. A session's own flood fills its own queue and nobody
-else's.
+zenoh's threads only put work and never block. A flood from one session fills only its own queue.
 """
 
 import collections
@@ -13,22 +12,22 @@ from typing import Any
 
 from rever_env import protocol
 
-_REQUESTS_MAX = 4  # of one session: its holder has one at a time and sends again what is dropped
-_QUERIES_MAX = 64  # for all sessions together
+_REQUESTS_MAX = 4  # per session: its holder sends one request at a time and resends a dropped one
+_QUERIES_MAX = 64  # for all queries together
 
 Work = Callable[[], None]
 
 
 @dataclass
 class _Source:
-    """Where work comes from; it takes its turn while something waits in it."""
+    """A queue of one origin; it takes its turn while it is not empty."""
 
     limit: int
     waiting: collections.deque[Work] = field(default_factory=collections.deque)
 
 
 class Inbox:
-    """Shared with zenoh's threads."""
+    """The queues. zenoh's threads put, the simulation thread takes."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -38,7 +37,7 @@ class Inbox:
     def session(self, answer: Callable[[bytes | protocol.TooLarge], None]) -> Callable[[Any], None]:
         """A callback for the samples of a session's requests.
 
-        It copies what is not too large; answer: called by the simulation thread.
+        It copies requests up to the size limit. answer: called by the simulation thread.
         """
         source = _Source(_REQUESTS_MAX)
 
@@ -56,11 +55,11 @@ class Inbox:
         return on_request
 
     def put_query(self, work: Work) -> bool:
-        """Whether there was room."""
+        """Whether the queue had room."""
         return self._put(self._queries, work)
 
     def take(self, deadline: float) -> Work | None:
-        """What is next, waited for until the deadline by the monotonic clock."""
+        """The next work; waits until the deadline of the monotonic clock."""
         with self._changed:
             while not self._turns:
                 left = deadline - time.monotonic()

@@ -1,4 +1,4 @@
-"""The space of instructions: one for all tasks, and readable from shared memory."""
+"""Instruction: one space for the instructions of all tasks, readable from shared memory."""
 
 import string
 from collections.abc import Sequence
@@ -22,16 +22,16 @@ _PRINTABLE = string.ascii_letters + string.digits + string.punctuation + " "
 class Instruction(spaces.Text):
     """Any text within the protocol's limit; samples are printable ASCII.
 
-    Text itself lists its characters one by one, so that two tasks have two spaces, and Gymnasium's
-    AsyncVectorEnv reads Text from shared memory only once, before the first reset: every
-    instruction would be blank. This space is the same for all tasks and is read at every step.
+    gymnasium.spaces.Text has a fixed set of characters, so that two tasks would have different
+    spaces; and AsyncVectorEnv reads it from shared memory only once, before the first reset, so
+    that every instruction would be blank. This space is equal for all tasks and read at each step.
     """
 
     def __init__(self, seed: int | np.random.Generator | None = None) -> None:
         super().__init__(limits.TEXT_BYTES_MAX, min_length=0, charset=_PRINTABLE, seed=seed)
 
     def contains(self, x: Any) -> bool:
-        """Whether it is a text that the protocol can carry, in whatever language."""
+        """Whether x is a text, in any language, within the protocol's limit."""
         return isinstance(x, str) and len(_encoded(x)) <= limits.TEXT_BYTES_MAX
 
     def __repr__(self) -> str:
@@ -39,7 +39,7 @@ class Instruction(spaces.Text):
 
 
 class _SharedTexts(Sequence[str]):
-    """The instructions in shared memory as they are now; a copy keeps what they are then."""
+    """A view of the instructions in shared memory; a copy keeps the present ones."""
 
     def __init__(self, rows: NDArray[np.uint8]) -> None:
         self._rows = rows  # (environments, bytes), each text padded with zeros

@@ -1,4 +1,4 @@
-"""Initial layouts: the 24 of the published grid, and random ones that stay clear of them."""
+"""Initial layouts: SIMPLER's 24 of each task, and random ones at a distance from them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -8,12 +8,12 @@ from rever_env.tasks import Layout, Pose, Task
 
 _MASK = (1 << 64) - 1
 _DRAWS_MAX = 10_000
-SEED_LIMIT = 1 << 53  # seeds stay exact in a double
+SEED_LIMIT = 1 << 53  # seeds must be exact in a double
 
 
 @dataclass
 class SplitMix64:
-    """Steele, Lea and Flood's generator: one 64-bit word of state, the same in every language."""
+    """SplitMix64 by Steele, Lea and Flood: one 64-bit word of state, equal in every language."""
 
     state: int
 
@@ -30,7 +30,7 @@ class SplitMix64:
 
 
 def place(task: Task, layout: int | None, seed: int) -> Layout:
-    """The layout of one reset: a grid layout, or a draw from the seed."""
+    """The layout of one reset: a fixed one, or one drawn from the seed."""
     if not 0 <= seed < SEED_LIMIT:
         raise InvalidReset(f"seed {seed}: expected 0 <= seed < 2^53")
     check_layout(task.name, layout, len(task.layouts))
@@ -72,7 +72,7 @@ def _draw(task: Task, seed: int) -> Layout:
         )
         apart = _distance(layout.source_x - layout.target_x, layout.source_y - layout.target_y)
         if apart >= ranges.separation_min and not near_grid_layout(task, layout):
-            # After source and target, which are then where they are without distractors.
+            # After source and target, so that these are where they are without distractors.
             return replace(layout, distractors=_draw_distractors(task, layout, generator, seed))
     raise InvalidReset(f"task {task.id}, seed {seed}: no free layout in {_DRAWS_MAX} draws")
 
@@ -103,7 +103,7 @@ def _draw_distractors(
 
 
 def _fnv1a(text: str) -> int:
-    """64-bit FNV-1a: mixes the task's name into the stream, so that tasks do not share draws."""
+    """64-bit FNV-1a hash: the task's name makes the random streams of tasks different."""
     digest = 0xCBF29CE484222325
     for byte in text.encode():
         digest = ((digest ^ byte) * 0x100000001B3) & _MASK
@@ -111,7 +111,7 @@ def _fnv1a(text: str) -> int:
 
 
 def _distance(x: float, y: float) -> float:
-    # Square root of plain products: correctly rounded, so equal in every language (hypot is not).
+    # Square root of plain products: correctly rounded and equal in every language (hypot is not).
     return math.sqrt(x * x + y * y)
 
 

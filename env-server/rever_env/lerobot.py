@@ -1,7 +1,4 @@
-"""The tasks under LeRobot's names: what its EnvHub asks for, as vectors of environments.
-
-Observations have LeRobot's keys: pixels (uint8, height x width x 3) and agent_pos (float32, 8).
-"""
+"""The Bridge tasks for LeRobot's EnvHub: make_env and environments with LeRobot's keys."""
 
 import multiprocessing
 from functools import partial
@@ -22,11 +19,19 @@ Fields = dict[str, Any]
 
 
 class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
-    """One task, as TASK or TASK/VARIANT.
+    """One Bridge task with LeRobot's observation keys.
 
-    connect: a server elsewhere; None for a world in this process.
-    info["is_success"] is the episode's result, False before the last step: LeRobot counts an
-    episode as a success where any of its steps says so.
+    Arguments:
+        task: TASK or TASK/VARIANT.
+        connect: endpoint of a server; None simulates in this process.
+        image_side: pixels per side of the square image.
+
+    Observation (dict): pixels, uint8 (image_side, image_side, 3), RGB; agent_pos, float32 (8,), the
+    state of BridgeEnv. The instruction is the attribute task_description.
+    Action, control rate, reward, termination, truncation and errors: as in BridgeEnv, or in
+    RemoteEnv with connect.
+    Info: as in BridgeEnv, except that is_success is the episode's result and False before the last
+    step: LeRobot counts an episode as a success if is_success is true at any step.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
@@ -56,25 +61,25 @@ class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
     def reset(
         self, *, seed: int | None = None, options: Fields | None = None
     ) -> tuple[Fields, Fields]:
-        """As of the environment inside; LeRobot's own options are left out."""
+        """Begins an episode. options: {"layout": K} for a fixed layout; others are ignored."""
         super().reset(seed=seed)
         own = {name: value for name, value in (options or {}).items() if name == "layout"}
         observation, info = self._inner.reset(seed=seed, options=own)
         return self._fields(observation), {**info, "is_success": False}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Fields, float, bool, bool, Fields]:
-        """As of the environment inside."""
+        """Executes one control step; see the class for what it returns."""
         observation, reward, terminated, truncated, info = self._inner.step(action)
         info["is_success"] = info["is_success"] and (terminated or truncated)
         return self._fields(observation), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8]:
-        """The last observation's image."""
+        """The image of the last observation, uint8 (image_side, image_side, 3)."""
         image: NDArray[np.uint8] = self._inner.render()
         return image
 
     def close(self) -> None:
-        """Closes the environment inside."""
+        """Closes the simulation or the session."""
         self._inner.close()
 
     def _fields(self, observation: Fields) -> Fields:
@@ -85,18 +90,23 @@ class LeRobotEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
 def make_env(
     n_envs: int = 1, use_async_envs: bool = False, cfg: Any = None
 ) -> dict[str, dict[int, VectorEnv[Any, Any, Any]]]:
-    """Every task by its number, `n_envs` environments each.
+    """Vector environments for LeRobot, as {"rever": {index of the task: vector}}.
 
-    cfg may have `connect`, the endpoint of a server or router elsewhere (None: worlds in this
-    process), `image_side` in pixels (default: 256), and `tasks`, a list of TASK or TASK/VARIANT
-    (default: every task).
+    Arguments:
+        n_envs: environments per task.
+        use_async_envs: one process per environment (AsyncVectorEnv) instead of SyncVectorEnv.
+        cfg: object with any of these attributes. connect: endpoint of a server or router (default:
+            simulate in this process). image_side: pixels (default: 256). tasks: list of TASK or
+            TASK/VARIANT (default: every task in its default variant).
 
-    The last step begins the next episode (SAME_STEP): LeRobot reads an episode's success from
-    info["final_info"], which only this mode has.
+    The vectors reset at the last step of an episode (AutoresetMode.SAME_STEP): LeRobot reads the
+    success of an episode from info["final_info"], which only this mode provides.
+
+    Raises rever_env.fault.InvalidReset for an unknown task, and what LeRobotEnv raises.
     """
     connect = getattr(cfg, "connect", None)
     image_side = getattr(cfg, "image_side", _SIDE)
-    # A forked process cannot use the network that its parent has opened.
+    # zenoh does not survive a fork.
     forkserver = "forkserver" in multiprocessing.get_all_start_methods()
     start_method = "forkserver" if forkserver else "spawn"
     vectors: dict[int, VectorEnv[Any, Any, Any]] = {}

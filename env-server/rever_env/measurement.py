@@ -20,7 +20,7 @@ _CHUNK = 10  # episodes per unit of work
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some episodes of one task and suite for one process."""
+    """A chunk of episodes of one task and suite, run by one process."""
 
     task: Task
     suite: str  # "grid", "random" or "random, noise"
@@ -39,7 +39,7 @@ class Row:
     successes: int = 0  # at the last step of the horizon
     released: int = 0
     grasped: int = 0
-    steps_to_release: int = 0  # summed over the episodes that were ever released
+    steps_to_release: int = 0  # summed over the episodes with a released success
     ever_released: int = 0
     worst_steps: int = 0
     seconds: float = 0.0
@@ -78,13 +78,14 @@ def measure(
             done = sum(row.episodes for row in rows.values())
             seconds = time.monotonic() - started
             report(
-                f"{done} of {total} episodes, about {(total - done) * seconds / done:.0f} s left"
+                f"{done} of {total} episodes, "
+                f"about {(total - done) * seconds / done:.0f} s remaining"
             )
     return list(rows.values())
 
 
 def run(chunk: Chunk) -> Row:
-    """The episodes of one chunk; each runs to its horizon, as SIMPLER's last-step rule asks."""
+    """Runs the episodes of one chunk to their horizon: SIMPLER judges the last step."""
     row = Row(str(chunk.task.id), chunk.suite)
     world = _world(chunk)
     try:
@@ -99,7 +100,7 @@ def run(chunk: Chunk) -> Row:
 
 def _world(chunk: Chunk) -> "World | RobosuiteWorld":
     if not chunk.in_robosuite:
-        # The images are not looked at: a tiny one keeps rendering cheap.
+        # The images are not used: tiny ones keep rendering cheap.
         return World(chunk.task, image_height=8, image_width=8)
     from rever_env.robosuite_tasks import bridge_task
     from rever_env.robosuite_world import RobosuiteWorld
@@ -108,7 +109,7 @@ def _world(chunk: Chunk) -> "World | RobosuiteWorld":
 
 
 def table(rows: list[Row]) -> str:
-    """A text table with Wilson intervals (95 %)."""
+    """The rows as a text table with 95 % Wilson intervals."""
     head = ("task", "suite", "success", "95 % interval", "released", "grasped", "release step")
     lines = [head]
     for row in rows:
@@ -137,7 +138,7 @@ def table(rows: list[Row]) -> str:
 
 
 def wilson(successes: int, episodes: int) -> tuple[float, float]:
-    """Wilson's score interval at 95 %."""
+    """The 95 % Wilson score interval of a rate."""
     if episodes == 0:
         return 0.0, 1.0
     z = 1.959963984540054

@@ -1,4 +1,4 @@
-"""A task's scene in MuJoCo's XML: its includes in place, and what the task changes in it."""
+"""A task's scene in MuJoCo's XML, with its includes and the task's changes applied."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -11,7 +11,7 @@ Element = ElementTree.Element
 
 
 def compile(task: Task) -> mujoco.MjModel:
-    """The scene as MuJoCo's model."""
+    """The scene as a compiled MuJoCo model."""
     text = ElementTree.tostring(scene(task), encoding="unicode")
     try:
         return mujoco.MjModel.from_xml_string(text)
@@ -20,7 +20,7 @@ def compile(task: Task) -> mujoco.MjModel:
 
 
 def scene(task: Task) -> Element:
-    """The scene as one tree, for what compiles it."""
+    """The scene as one XML tree."""
     root = _included(task.scene)
     for change in task.mjcf:
         found = elements(root, change)
@@ -34,7 +34,7 @@ def scene(task: Task) -> Element:
 
 
 def elements(root: Element, change: MjcfChange) -> list[Element]:
-    """What a change is about; an element without a name, as inertial, goes by its parent's."""
+    """The elements that a change names; a nameless one (inertial) goes by its parent's name."""
     parents = {child: parent for parent in root.iter() for child in parent}
 
     def name(element: Element) -> str | None:

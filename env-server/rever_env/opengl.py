@@ -1,7 +1,7 @@
 """Offscreen OpenGL contexts on Linux without a window: EGL on Mesa's software device.
 
-The device is chosen here, not by environment variables or by a display, so that images are the same
-on every machine and in every process.
+This module chooses the device, independently of environment variables and displays, so that images
+are the same on every machine and in every process.
 """
 
 import ctypes
@@ -17,7 +17,7 @@ from pathlib import Path
 from rever_env.fault import RendererUnavailable
 
 HAS_EGL = sys.platform == "linux"  # elsewhere MuJoCo's own contexts are used
-_PACKAGES = "libegl1, libopengl0 and libgl1-mesa-dri"  # of Debian and Ubuntu
+_PACKAGES = "libegl1, libopengl0 and libgl1-mesa-dri"  # Debian and Ubuntu
 _DEVICES_MAX = 16
 # Values of the EGL 1.5 headers.
 _PLATFORM_DEVICE, _EXTENSIONS, _OPENGL_API, _DRAW, _READ = 0x313F, 0x3055, 0x30A2, 0x3059, 0x305A
@@ -30,11 +30,11 @@ _CONFIGURATION = (
     (0x3025, 24),  # depth bits
     (0x3026, 8),  # stencil bits
     (0x303F, 0x308E),  # RGB
-    (0x3033, 1),  # off the screen
+    (0x3033, 1),  # offscreen
     (0x3040, 8),  # OpenGL
 )
 _END = 0x3038
-# Variables that would choose another driver or device.
+# Environment variables that choose another driver or device.
 _DRIVER_CHOICES = ("EGL_PLATFORM", "GALLIUM_DRIVER", "MESA_LOADER_DRIVER_OVERRIDE")
 _VENDOR_FILES, _VENDOR_FOLDERS = "__EGL_VENDOR_LIBRARY_FILENAMES", "__EGL_VENDOR_LIBRARY_DIRS"
 _Pointer = ctypes.c_void_p
@@ -52,7 +52,7 @@ class Context:
 
     @contextmanager
     def current(self) -> Iterator[None]:
-        """Makes it current in this thread; afterwards what was current before is so again."""
+        """Makes the context current in this thread; restores the previous one afterwards."""
         egl = self._display.library
         before = _current(egl)
         self._display.make_current(self._handle)
@@ -62,20 +62,20 @@ class Context:
             egl.eglMakeCurrent(*(before or self._display.nothing))
 
     def free(self) -> None:
-        """Frees it; it must not be current."""
+        """Frees the context; it must not be current."""
         self._display.library.eglDestroyContext(self._display.handle, self._handle)
 
 
 @contextmanager
 def preserved_context() -> Iterator[None]:
-    """Restores this thread's current context after code that makes contexts of its own current.
+    """Restores this thread's current context after code that makes its own contexts current.
 
-    A context that stays current in a thread cannot be used in another one.
+    A context that stays current in one thread cannot be used in another.
     """
     try:
         egl = _library()
     except RendererUnavailable:
-        yield  # no EGL: such code draws in another way
+        yield  # no EGL: such code renders in another way
         return
     before = _current(egl)
     try:
@@ -89,7 +89,7 @@ def preserved_context() -> Iterator[None]:
 
 
 def unavailable() -> str | None:
-    """The reason why this process cannot render images; None if it can."""
+    """Why this process cannot render images; None if it can."""
     try:
         if HAS_EGL:
             Context().free()
@@ -99,9 +99,9 @@ def unavailable() -> str | None:
 
 
 def choose_device_for_other_libraries() -> None:
-    """Makes MuJoCo's, robosuite's and Gymnasium's renderers use the same device as this module.
+    """Makes the renderers of MuJoCo, robosuite and Gymnasium use the device of this module.
 
-    They read the environment when they are imported or first draw.
+    They read the environment variables on import or when they first render.
     """
     if not HAS_EGL:
         return
@@ -111,9 +111,9 @@ def choose_device_for_other_libraries() -> None:
 
 
 def isolate_process() -> list[str]:
-    """Removes variables from this process's environment that would choose another renderer.
+    """Removes environment variables of this process that would choose another renderer.
 
-    For programs of rever_env, before OpenGL is loaded. Returns warnings for the user.
+    For the command line, before OpenGL is loaded. Returns warnings for the user.
     """
     if not HAS_EGL:
         return []
@@ -125,17 +125,17 @@ def isolate_process() -> list[str]:
         given = os.environ.get(name)
         if given is not None and not _names_mesa(name, given):
             del os.environ[name]
-            warnings.append(f"ignored {name}={given}: it names no library of Mesa")
+            warnings.append(f"ignored {name}={given}: expected a library of Mesa")
     os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = "egl"
     try:
         _library()
     except RendererUnavailable:
-        os.environ["MUJOCO_GL"] = "disable"  # else MuJoCo could not even be imported
+        os.environ["MUJOCO_GL"] = "disable"  # otherwise the import of MuJoCo would fail
     return warnings
 
 
 def _names_mesa(variable: str, value: str) -> bool:
-    """Whether vendor files of EGL, or one in these folders, load Mesa's library."""
+    """Whether these EGL vendor files, or one in these folders, load Mesa's library."""
     paths = [Path(path) for path in value.split(":") if path]
     if variable == _VENDOR_FOLDERS:
         paths = [file for folder in paths for file in folder.glob("*.json")]
@@ -149,13 +149,13 @@ def _names_mesa(variable: str, value: str) -> bool:
 
 
 class _Display:
-    """EGL's display of one device. device: its number among all devices."""
+    """The EGL display of one device. device: its index among all devices."""
 
     def __init__(self) -> None:
         self.library = egl = _library()
         devices = _devices(egl)
         is_software = [_is_software(egl, device) for device in devices]
-        # Without Mesa's software device any device is better than none.
+        # Fall back to any other device if there is no software device of Mesa.
         for index in sorted(range(len(devices)), key=lambda index: not is_software[index]):
             display = egl.eglGetPlatformDisplay(_PLATFORM_DEVICE, devices[index], None)
             if display is not None and egl.eglInitialize(display, None, None):
@@ -163,7 +163,7 @@ class _Display:
                 break
         else:
             raise RendererUnavailable(
-                f"none of {len(devices)} EGL devices works (Debian packages {_PACKAGES}"
+                f"none of {len(devices)} EGL devices works (install the Debian packages {_PACKAGES}"
                 f"{_set_variables()})"
             )
         attributes = [number for pair in _CONFIGURATION for number in pair] + [_END]
@@ -176,7 +176,7 @@ class _Display:
             ctypes.byref(count),
         )
         if not found or count.value < 1:
-            raise RendererUnavailable("EGL has no configuration of 8-bit colours, 24-bit depth")
+            raise RendererUnavailable("EGL has no configuration with 8-bit colours, 24-bit depth")
         self._configuration = configuration
         self.nothing: _Current = (self.handle, None, None, None)
 
@@ -185,7 +185,7 @@ class _Display:
         egl.eglBindAPI(_OPENGL_API)
         context: int | None = egl.eglCreateContext(self.handle, self._configuration, None, None)
         if context is None:
-            raise RendererUnavailable(f"EGL cannot make a context: error {_error(egl)}")
+            raise RendererUnavailable(f"EGL cannot create a context: error {_error(egl)}")
         return context
 
     def make_current(self, context: int) -> None:
@@ -206,7 +206,7 @@ def _display() -> _Display:
 @cache
 def _library() -> ctypes.CDLL:
     try:
-        # Global: MuJoCo looks for EGL among the process's symbols.
+        # RTLD_GLOBAL: MuJoCo searches the process's symbols for EGL.
         egl = ctypes.CDLL("libEGL.so.1", mode=ctypes.RTLD_GLOBAL)
         declared = {
             "eglGetProcAddress": (_Pointer, ctypes.c_char_p),
@@ -227,7 +227,7 @@ def _library() -> ctypes.CDLL:
             function.restype, function.argtypes = result, parameters
     except (OSError, AttributeError) as error:
         raise RendererUnavailable(
-            f"no libEGL.so.1 with EGL 1.5: {error} (Debian packages {_PACKAGES})"
+            f"expected libEGL.so.1 with EGL 1.5: {error} (install the Debian packages {_PACKAGES})"
         ) from error
     return egl
 
@@ -252,7 +252,7 @@ def _is_software(egl: ctypes.CDLL, device: int) -> bool:
 
 
 def _current(egl: ctypes.CDLL) -> _Current | None:
-    """What is current in this thread: display, surfaces to draw to and to read from, context."""
+    """What is current in this thread: display, draw surface, read surface, context."""
     context = egl.eglGetCurrentContext()
     if context is None:
         return None
@@ -265,6 +265,6 @@ def _error(egl: ctypes.CDLL) -> str:
 
 
 def _set_variables() -> str:
-    """The variables that may be the reason, with their values."""
+    """The environment variables that may be the cause, with their values."""
     names = (_VENDOR_FILES, _VENDOR_FOLDERS, *_DRIVER_CHOICES)
     return "".join(f", {name}={os.environ[name]}" for name in names if name in os.environ)

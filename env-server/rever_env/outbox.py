@@ -1,7 +1,6 @@
-"""What leaves the server, sent by other threads than the simulation's.
+"""Outgoing messages of a server, sent from other threads than the simulation thread.
 
-zenoh makes a sender wait for a peer that stops reading, up to a minute, and nobody else may wait
-with it.
+zenoh blocks a sender for up to a minute if a peer stops reading. The simulation must not block.
 """
 
 import contextlib
@@ -14,15 +13,15 @@ import zenoh
 
 _log = logging.getLogger(__name__)
 
-_ANSWERING_MAX = 64  # threads that answer queries at one time; almost always there is none
-# Queries that wait for their end unanswered, and what they hold: more than ordinary use brings in
-# the minute until zenoh closes the link of a peer that stopped reading.
+_ANSWERING_MAX = 64  # concurrent threads that answer queries; usually there is none
+# Discarded queries that wait for their end, and their bytes: more than ordinary use brings in the
+# minute until zenoh closes the link of a peer that stopped reading.
 _DISCARDED_MAX = 16_384
 _DISCARDED_BYTES_MAX = 32 << 20
 
 
 class Outbox:
-    """A session's replies. close() ends its thread after the last one."""
+    """The replies of a session. close() ends its thread after the last reply."""
 
     def __init__(self, publisher: Any) -> None:
         self._publisher = publisher
@@ -32,13 +31,13 @@ class Outbox:
         threading.Thread(target=self._send_all, name="replies", daemon=True).start()
 
     def send(self, reply: bytes) -> None:
-        """Sends a reply in the place of one that still waits: its holder asks again for it."""
+        """Sends a reply in place of one that still waits: its holder resends the request."""
         with self._changed:
             self._reply = reply
             self._changed.notify()
 
     def close(self) -> None:
-        """Sends nothing more than what waits."""
+        """Ends the thread once the waiting reply is sent."""
         with self._changed:
             self._has_ended = True
             self._changed.notify()
@@ -48,7 +47,7 @@ class Outbox:
             try:
                 self._publisher.put(reply)
             except zenoh.ZError as error:
-                _log.warning("a reply was not sent: %s", error)
+                _log.warning("cannot send a reply: %s", error)
         with contextlib.suppress(zenoh.ZError):  # the network may be closed already
             self._publisher.undeclare()
 
@@ -61,7 +60,7 @@ class Outbox:
 
 
 class Answers:
-    """Answers to queries. zenoh tells the asker of a query's end, for which it may wait, too."""
+    """Answers to queries. Ending a query sends a message, which may block as well."""
 
     def __init__(self) -> None:
         self._answering = threading.Semaphore(_ANSWERING_MAX)
@@ -71,7 +70,7 @@ class Answers:
         threading.Thread(target=self._discard_all, name="discarded", daemon=True).start()
 
     def send(self, query: Any, key: str, answer: bytes) -> None:
-        """Answers in a thread of its own; not where too many answers wait for their readers."""
+        """Answers in a new thread; discards the query if too many answers are blocked."""
         if not self._answering.acquire(blocking=False):
             self.discard(query)
             return
@@ -80,7 +79,7 @@ class Answers:
             try:
                 query.reply(key, answer)
             except zenoh.ZError as error:
-                _log.warning("a query was not answered: %s", error)
+                _log.warning("cannot answer a query: %s", error)
             finally:
                 query.drop()
                 self._answering.release()
@@ -88,7 +87,7 @@ class Answers:
         threading.Thread(target=reply, name="answer", daemon=True).start()
 
     def discard(self, query: Any) -> None:
-        """Ends a query unanswered without waiting, but for a peer that reads none of many ends."""
+        """Ends a query unanswered. It blocks only if the queue of discarded queries is full."""
         if self._discarded_bytes > _DISCARDED_BYTES_MAX:
             query.drop()
             return
@@ -96,7 +95,7 @@ class Answers:
         self._discarded.put(query)
 
     def close(self) -> None:
-        """Ends the thread that ends queries; those that wait are ended before."""
+        """Ends the thread after all waiting queries."""
         self._discarded.put(None)
 
     def _discard_all(self) -> None:
@@ -111,5 +110,5 @@ class Answers:
 
 
 def size(query: Any) -> int:
-    """Bytes of a query's payload."""
+    """The size of a query's payload in bytes."""
     return 0 if query.payload is None else len(query.payload)

@@ -1,4 +1,4 @@
-"""Where a gripper is, as a robot's base sees it."""
+"""The pose of a gripper in the frame of the robot's base."""
 
 import math
 
@@ -12,10 +12,10 @@ Vector = NDArray[np.float64]
 def in_base(
     base: Vector, base_axes: Vector, position: Vector, axes: Vector, reference: Vector | None = None
 ) -> tuple[float, ...]:
-    """x y z (m) roll pitch yaw (rad) of a frame in the base's; axes: 9 numbers or (3, 3).
+    """x y z (m) and roll pitch yaw (rad) of a frame in the base frame.
 
-    reference, (3, 3): attitude that counts as zero. MuJoCo's own products: numpy's may sum in
-    another order on another processor.
+    axes: 9 numbers or (3, 3). reference, (3, 3): the attitude that counts as zero. MuJoCo computes
+    the products, because numpy may sum in another order on another processor.
     """
     base_axes = base_axes.reshape(3, 3)
     translation, attitude = np.zeros(3), np.zeros((3, 3))

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from rever_env.expert import SUBTASKS, Decision
 from rever_env.tasks import Task
 
-COORDINATES_SIDE = 256  # coordinates live in a square of this side over the whole image
-COORDINATE_STEP = 2  # and are multiples of this
+COORDINATES_SIDE = 256  # the image is mapped to a square of this side
+COORDINATE_STEP = 2  # coordinates are multiples of this
 Box = tuple[int, int, int, int]  # x1, y1, x2, y2, corners included
 
 _AXES = (("forward", "backward"), ("left", "right"), ("up", "down"))  # base frame x, y, z
-_MOVE_MIN = 0.003  # metres: below this a step is not called a move
-_AXIS_SHARE = 0.35  # an axis is named from this share of the largest one on
+_MOVE_MIN = 0.003  # metres: a smaller step is not called a move
+_AXIS_SHARE = 0.35  # an axis is named if its share of the largest one is at least this
 _TURN_MIN = 0.05  # rad
 
 
@@ -39,7 +39,7 @@ def compose(
 
 
 def phrases(tasks: Iterable[Task]) -> list[str]:
-    """Every fixed segment of ` ` + text + ` ACTION:` between coordinates and choices."""
+    """All fixed segments of ` ` + text + ` ACTION:` between coordinates and choices."""
     tasks = list(tasks)
     found: list[str] = []
     for task in tasks:
@@ -62,7 +62,7 @@ def all_moves() -> list[str]:
 
 
 def move_words(decision: Decision, opening: float) -> str:
-    """What the action does, in words."""
+    """The MOVE text of an action."""
     translation = decision.action[:3]
     largest = float(np.abs(translation).max())
     if largest >= _MOVE_MIN:
@@ -80,7 +80,7 @@ def move_words(decision: Decision, opening: float) -> str:
 
 
 def visible_box(bodies: NDArray[np.int32], body: int) -> Box | None:
-    """Box of a body's visible pixels in the square of side 256; None when fully hidden."""
+    """The box of a body's visible pixels in the square of side 256; None if it is hidden."""
     height, width = bodies.shape
     rows, columns = np.nonzero(bodies == body)
     if len(rows) == 0:
@@ -94,7 +94,7 @@ def visible_box(bodies: NDArray[np.int32], body: int) -> Box | None:
 
 
 def square_pixel(x: float, y: float) -> tuple[int, int]:
-    """An image point (each 0 to 1) as even coordinates, kept inside the image."""
+    """An image point (each coordinate 0 to 1) as even coordinates inside the square."""
     return _even(x), _even(y)
 
 

@@ -1,6 +1,7 @@
-"""The Gymnasium ids of every task and of environments elsewhere; importing rever_env adds them.
+"""Registers the Gymnasium ids of the Bridge tasks and of remote environments.
 
-A task's variants have its id: gymnasium.make(ID, variant=NAME).
+Importing rever_env registers them. A variant has the id of its task:
+gymnasium.make(ID, variant=NAME).
 """
 
 from typing import Any
@@ -13,11 +14,11 @@ REMOTE_ID = "rever/Remote-v1"
 
 
 def register() -> None:
-    """Adds what is not there yet; imports no simulator."""
+    """Registers the ids that are not registered yet; imports no simulator."""
     offered = tasks.load().values()
     ids: dict[str, dict[str, Any]] = {}
     for task in offered:
-        # The environment itself truncates a variant with fewer steps than another one.
+        # The environment itself truncates episodes of a variant that has fewer steps.
         steps_max = max(one.steps_max for one in offered if one.gymnasium_id == task.gymnasium_id)
         ids.setdefault(
             task.gymnasium_id,
@@ -29,7 +30,7 @@ def register() -> None:
         )
     ids[REMOTE_ID] = {
         "entry_point": "rever_env.remote:RemoteEnv",
-        # Its server truncates.
+        # No max_episode_steps: the server truncates.
         "vector_entry_point": "rever_env.remote_vector:RemoteVectorEnv",
     }
     for name, arguments in ids.items():

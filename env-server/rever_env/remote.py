@@ -1,4 +1,4 @@
-"""Environments that run in servers elsewhere, as Gymnasium environments."""
+"""RemoteEnv: an environment of a server in another process, as a Gymnasium environment."""
 
 from dataclasses import asdict, replace
 from typing import Any
@@ -36,33 +36,48 @@ Stepped = tuple[Fields, float, bool, bool, Fields]
 
 
 class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
-    """One session of a server that speaks protocol/README.md, whatever simulator it is.
+    """One session of an environment server that implements protocol/README.md, of any simulator.
 
-    Arguments
-        connect: endpoints of servers or of a router, as tcp/HOST:PORT or HOST:PORT, or one of them.
-        task: TASK or TASK/VARIANT; by default the first that the server offers. variant: instead
-        of /VARIANT.
-        image_height, image_width: pixels, 1 to 1024; 0 and 0 for no image.
-        fleet: namespace of the servers. server: id of one of them; by default the least used.
-        expert: info has "expert_action", float32, what the server's scripted expert would do.
-        wait_secs: for a server with a free session (default: 30 s for a session to be free, but
-        2 to 5 s for a server to be there). reply_secs: for a reply, also while the server is
-        paused.
+    Arguments:
+        connect: endpoint of a server or router, tcp/HOST:PORT or HOST:PORT, or a tuple of them.
+        task: TASK or TASK/VARIANT. Default: the first task that the server offers.
+        variant: the variant, instead of /VARIANT in task.
+        image_height, image_width: pixels, 1 to 1024 each; 0 and 0 for no image.
+        fleet: namespace; only servers of the same fleet are found.
+        server: id of one server. Default: the server with the most free sessions.
+        expert: add "expert_action", the action of the server's scripted expert, to every info.
+        render_mode: "rgb_array", or None for an environment whose render() returns None.
+        wait_secs: timeout in seconds for a server with a free session. Default: 2 s while
+            connections are refused, 5 s while no server is found, 30 s while no session is free.
+        reply_secs: timeout in seconds for one reply, including the time that a server is paused.
 
-    Observation: image uint8 (height, width, 3), state float32 (n,), instruction text. Without
-    images (0 x 0 pixels, or a server that has none) or numbers that part is left out, and
-    without images render_mode is None.
-    Action: float32 (n,), or a whole number where the task has a choice of actions. What the numbers
-    are, session.task.state and session.task.action say; of a Bridge task see BridgeEnv.
-    Reward, end of episodes and info: as the served environment has them. metadata["render_fps"] is
-    its control rate. info has the flags of BridgeEnv; of other environments only is_success and
-    ever_success are known.
+    Observation (dict):
+        image: uint8 (image_height, image_width, 3), RGB. Absent for 0 x 0 pixels or for a task
+            without images; render_mode is None then.
+        state: float32 (n,). Absent for a task without numbers.
+        instruction: str.
 
-    RemoteFault is raised when the environment or the way to it breaks, which is never a reward: the
-    next reset begins a new episode, over a new session if need be, and finds a server that was
-    started again. RemoteRefused is raised when the server refuses a request, ValueError for invalid
-    arguments, gymnasium.error.ClosedEnvironmentError after close.
-    Use it in one thread at a time, and in the process that made it: zenoh does not survive a fork.
+    Action: float32 (n,); an int (Discrete) or int64 (n,) (MultiDiscrete) for discrete actions.
+    session.task.state and session.task.action name each number with its bounds. For Bridge tasks
+    the units are those of BridgeEnv.
+
+    Control rate: metadata["render_fps"] in steps per second of simulated time, if it is known.
+    Reward, termination and truncation: those of the served environment.
+
+    Info of step(): the flags of BridgeEnv. Of environments other than the Bridge tasks only
+    is_success and ever_success are known, and the other flags are False. action_followed exists
+    only for actions that are Bridge's. Info of reset(): seed, int. Both: expert_action, float32
+    (n,), with expert=True.
+
+    Raises:
+        RemoteFault: the environment or the connection broke. It is never a reward. reset() begins a
+            new episode; if the session is lost, it opens another, on a restarted server too.
+        RemoteRefused: the server refused a request, for an unknown task or layout for instance.
+        ValueError: invalid arguments or actions.
+        gymnasium.error.ClosedEnvironmentError: used after close().
+
+    Use it from one thread at a time, and only in the process that created it: zenoh does not
+    survive a fork.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's form)
@@ -118,33 +133,36 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
     def reset(
         self, *, seed: int | None = None, options: Fields | None = None
     ) -> tuple[Fields, Fields]:
-        """Begins an episode; the same seed and options give the same one.
+        """Begins an episode. The same seed and options give the same episode.
 
-        seed: 0 to 2^53 - 1; None draws one. options: {"layout": 0..} for a fixed initial layout;
-        otherwise the seed draws it. info: seed, and expert_action if it was asked for.
+        seed: 0 to 2^53 - 1; None draws one. options: {"layout": K} selects the fixed initial layout
+        K; without it the seed draws a random layout.
         """
         self.send_reset(seed, options)
         return self.receive_reset()
 
     def step(self, action: NDArray[np.float32]) -> Stepped:
-        """One control step: observation, reward, terminated, truncated, info."""
+        """Executes one control step; see the class for what it returns."""
         self.send_step(action)
         return self.receive_step()
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A copy of the last observation's image; None before the first reset."""
+        """The image of the last observation, uint8 (height, width, 3), as a copy.
+
+        None before the first reset, without images, or with render_mode None.
+        """
         if self.render_mode is None or self._last is None:
             return None
         return _image(self._last)
 
     def close(self) -> None:
-        """Ends the session; a second call does nothing."""
+        """Closes the session; a second call does nothing."""
         if not self._is_closed:
             self._is_closed = True
             self.session.close()
 
     def send_reset(self, seed: int | None, options: Fields | None = None) -> None:
-        """The first half of reset: returns before the server has answered."""
+        """The first half of reset(): sends the request and returns before the server replies."""
         self._require_open()
         layout, seed = layout_of(options), seed_of(seed)
         super().reset(seed=seed)  # seeds the stream that later resets draw from
@@ -159,7 +177,7 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
         )
 
     def receive_reset(self) -> tuple[Fields, Fields]:
-        """The second half: waits for the answer."""
+        """The second half of reset(): waits for the reply."""
         reply = self.session.receive()
         if not isinstance(reply, protocol.Observed):
             raise RemoteFault(f"expected Observed, got {type(reply).__name__}")
@@ -173,18 +191,18 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
         return observation, {"seed": self._seed, **self._hints()}
 
     def send_step(self, action: NDArray[np.float32]) -> None:
-        """The first half of step."""
+        """The first half of step(): sends the request and returns before the server replies."""
         self._require_open()
         self._action = self.checked(action)
         numbers = tuple(self._action.reshape(-1).tolist())
         self.session.send(lambda sequence: protocol.Step(sequence, numbers))
 
     def checked(self, action: Any) -> NDArray[np.float32]:
-        """The action's numbers; ValueError for others than the space has."""
+        """The action as an array; ValueError if it does not fit the action space."""
         return action_numbers(self.action_space, action)
 
     def receive_step(self) -> Stepped:
-        """The second half."""
+        """The second half of step(): waits for the reply."""
         reply = self.session.receive()
         if not isinstance(reply, protocol.Stepped):
             raise RemoteFault(f"expected Stepped, got {type(reply).__name__}")
@@ -196,7 +214,7 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
         return observation, transition.reward, transition.terminated, transition.truncated, info
 
     def _open_again(self) -> None:
-        """Opens a session in place of the lost one, on whatever server is there now."""
+        """Opens a session in place of the lost one, on any server that offers the task now."""
         before = self.session
         before.close()
         self.session = RemoteSession(self._fleet, self._wanted, is_return=True)
@@ -204,8 +222,8 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
         if replace(told, instruction=expected.instruction) != expected:
             self.session.close()
             raise RemoteFault(
-                f"server {self.session.server}: expected task {expected.task} "
-                f"({expected.variant}) as server {before.server} had described it, got another"
+                f"server {self.session.server}: expected the task {expected.task}/"
+                f"{expected.variant} as server {before.server} described it, got another"
             )
 
     def _require_open(self) -> None:
@@ -228,7 +246,7 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
 
 
 def _image(observation: protocol.Observation) -> NDArray[np.uint8]:
-    """Writable, and nobody else's."""
+    """The image as a writable copy, uint8 (height, width, 3)."""
     image = observation.image
     pixels: NDArray[np.uint8] = np.array(np.frombuffer(image.pixels, np.uint8))
     return pixels.reshape(image.height, image.width, 3)

@@ -1,4 +1,4 @@
-"""The way to environment servers: a zenoh session, who is found over it, and whether it is gone."""
+"""The connection to environment servers: zenoh session, server discovery, loss detection."""
 
 import contextlib
 import ctypes
@@ -15,24 +15,24 @@ from rever_env import endpoint, protocol
 from rever_env.serving import Endpoints, cause
 from rever_env.tasks import TaskId
 
-_LOOK_SECS = 0.2  # between looks for a server
-_REFUSED_SECS = 2.0  # how long connections may be refused
-_NOBODY_SECS = 5.0  # how long no server may be found over a connection
-_WAIT_SECS = 30.0  # for a server that is there to be free, or to answer
-_REACH_SECS = 5.0  # for one connection
-_RETURN_SECS = 2.0  # from a new connection to the server's token
-_OUTAGE_SECS = 10.0  # a session outlives its holder's absence that long
+_LOOK_SECS = 0.2  # between two attempts to find a server
+_REFUSED_SECS = 2.0  # timeout while connections are refused
+_NOBODY_SECS = 5.0  # timeout while a connection leads to no server
+_WAIT_SECS = 30.0  # timeout for a free session, or for a server's reply to a query
+_REACH_SECS = 5.0  # timeout of one connection attempt
+_RETURN_SECS = 2.0  # from a new connection to the server's liveliness token
+_OUTAGE_SECS = 10.0  # a server keeps the session of an absent holder for so long
 
 
 class RemoteFault(RuntimeError):
-    """The environment or the way to it broke: the episode has no outcome.
+    """The environment or the connection to it broke: the episode has no outcome.
 
-    The next reset begins a new episode, over a new session if the old one is lost.
+    reset() begins a new episode and opens a new session if the old one is lost.
     """
 
 
 class ForkedProcess(RemoteFault):
-    """The process was forked after zenoh had been opened, which zenoh does not survive."""
+    """The process was forked after zenoh was opened; zenoh does not survive a fork."""
 
 
 class RemoteRefused(ValueError):
@@ -41,12 +41,14 @@ class RemoteRefused(ValueError):
 
 @dataclass(frozen=True)
 class Fleet:
-    """Which servers. connect: endpoints of servers or of a router, as tcp/HOST:PORT or HOST:PORT.
+    """The servers to choose from, and timeouts in seconds.
 
-    server: its id; without one, the server with most free sessions.
-    wait_secs: for a free session. None: 30 s, but 5 s where no server is found, 2 s where
-    connections are refused, and none at all where they are refused to a second session.
-    reply_secs: for a reply, including the time that a server is paused.
+    connect: endpoints of servers or of a router, tcp/HOST:PORT or HOST:PORT.
+    fleet: namespace of the servers.
+    server: id of one server; None chooses the server with the most free sessions.
+    wait_secs: timeout for a free session. None: 2 s while connections are refused (0 s for the
+    replacement of a lost session), 5 s while no server is found, 30 s while no session is free.
+    reply_secs: timeout for a reply, including the time that a server is paused.
     """
 
     connect: tuple[str, ...]
@@ -58,10 +60,11 @@ class Fleet:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What to open. task: None for the first that a server offers; or TASK, or TASK/VARIANT.
+    """The session to open.
 
-    variant: None for the one that task names, "default" of TASK alone. Images of 0 x 0 pixels are
-    none.
+    task: TASK or TASK/VARIANT; None for the first task that a server offers.
+    variant: None for the variant in task, which is "default" for TASK alone.
+    image_height, image_width: pixels; 0 and 0 for no image.
     """
 
     task: str | None
@@ -71,7 +74,7 @@ class Wanted:
     expert: bool
 
     def among(self, tasks: Sequence[protocol.TaskDescription]) -> protocol.TaskDescription | None:
-        """The first of the tasks that is wanted."""
+        """The first of the tasks that fits."""
         for one in tasks:
             if self.variant is None:
                 if self.task in (None, str(TaskId(one.task, one.variant))):
@@ -87,9 +90,9 @@ class Wanted:
 
 
 class Network:
-    """One zenoh session. It does not survive a fork, which is told at once.
+    """One zenoh session. ForkedProcess in a forked process, in which zenoh does not work.
 
-    is_return: a session was open here before, so that a refused connection is not waited for.
+    is_return: replaces a lost session, so that a refused connection is not retried.
     """
 
     def __init__(self, fleet: Fleet, *, is_return: bool = False) -> None:
@@ -114,7 +117,7 @@ class Network:
         self._is_routed = bool(self.zenoh.info.routers_zid())
         self._declared: list[Any] = []
         self._is_closed = False
-        self.is_absent = True  # no token of the server is seen (yet, or any more)
+        self.is_absent = True  # the server's liveliness token is not there (yet, or any more)
         self._was_seen = False
         self._absent_since = time.monotonic()
         self._connected_since: float | None = None  # while it is absent
@@ -123,21 +126,21 @@ class Network:
 
     @property
     def place(self) -> str:
-        """Where the servers are, for messages."""
+        """The endpoints as text, for messages."""
         return ", ".join(self._fleet.connect)
 
     @property
     def is_own(self) -> bool:
-        """Whether this process opened it, and did not inherit it by a fork."""
+        """Whether this process opened it; False where it was inherited by a fork."""
         return self._process == os.getpid()
 
     def declare(self, declared: Any) -> Any:
-        """Keeps what is declared until close."""
+        """Keeps a zenoh declaration until close."""
         self._declared.append(declared)
         return declared
 
     def close(self) -> None:
-        """Closes the session; does nothing in a forked process, whose parent still uses it."""
+        """Closes the session; does nothing in a forked process, because its parent uses it."""
         if self._is_closed or not self.is_own:
             return
         self._is_closed = True
@@ -148,9 +151,9 @@ class Network:
             self.zenoh.close()  # type: ignore[no-untyped-call]
 
     def find(self, wanted: "Wanted") -> protocol.Description:
-        """The named server, or of those that offer what is wanted the one with most free sessions.
+        """The named server, or the one with the most free sessions among those that offer the task.
 
-        RemoteRefused where servers are found and none offers it.
+        RemoteRefused if servers are found and none offers the task.
         """
         fleet = self._fleet
         started = time.monotonic()
@@ -172,7 +175,7 @@ class Network:
             if time.monotonic() > started + wait:
                 named = f' with id "{fleet.server}"' if fleet.server else ""
                 raise RemoteFault(
-                    f"environment servers at {self.place}: all sessions are in use, and none was "
+                    f"environment servers at {self.place}: all sessions are in use; none became "
                     f"free within {wait:g} s"
                     if found
                     else f"no environment server{named} found at {self.place} within {wait:g} s "
@@ -181,7 +184,7 @@ class Network:
             time.sleep(_LOOK_SECS)
 
     def watch(self, server: str, wake: Callable[[], None]) -> None:
-        """Follows the server's liveliness token; wake: called when it is gone."""
+        """Follows the server's liveliness token. wake: called when the token disappears."""
 
         def on_token(sample: Any) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
@@ -202,11 +205,10 @@ class Network:
         )
 
     def loss(self) -> str:
-        """What has become of the watched server, for messages; nothing while it may still answer.
+        """How the watched server was lost, for messages; empty while it may still reply.
 
-        One that is only paused may: for a while its connection stands, and then its endpoint still
-        accepts new ones. So may one behind a router, whose connection or whose router may come back
-        in time; a session outlives that as long.
+        A paused server may still reply: its endpoint accepts connections. A server behind a router
+        may reply when the router or the connection returns before the server ends the session.
         """
         if not self.is_absent:
             return ""
@@ -232,7 +234,7 @@ class Network:
         return False
 
     def _reach(self, wait: float) -> None:
-        """Waits until an endpoint accepts connections, for zenoh itself does not say why not."""
+        """Waits until an endpoint accepts connections: zenoh does not report why it cannot."""
         deadline = time.monotonic() + wait
         while True:
             problems = []
@@ -249,7 +251,7 @@ class Network:
             time.sleep(_LOOK_SECS)
 
     def _described(self) -> tuple[list[protocol.Description], str]:
-        """Every server that answers, and why one that answers cannot be understood."""
+        """All servers that reply, and why the description of another one cannot be read."""
         fleet, misread = self._fleet, ""
         key = self._keys.describe(fleet.server) if fleet.server else self._keys.describe_all()
         found = []
@@ -258,8 +260,8 @@ class Network:
             if reply.ok is not None:
                 try:
                     found.append(protocol.DESCRIPTION.decode(reply.ok.payload.to_bytes()))
-                except protocol.CodecError as error:  # of another version, for instance
-                    misread = f"; the description of one cannot be read: {error}"
+                except protocol.CodecError as error:  # another protocol version, for instance
+                    misread = f"; a server's description cannot be read: {error}"
         return found, misread
 
 
@@ -268,8 +270,8 @@ def require_own_process() -> None:
     if _first_process and _first_process[0] != os.getpid():
         raise ForkedProcess(
             f"remote environments do not work in a forked process: process {_first_process[0]} "
-            "had opened the network before the fork; start processes with "
-            "context='spawn' or 'forkserver'"
+            "opened the network before the fork; start processes with context='spawn' or "
+            "'forkserver'"
         )
 
 
@@ -285,7 +287,7 @@ _open_networks: "weakref.WeakSet[Network]" = weakref.WeakSet()
 
 
 def _keep_inherited() -> None:
-    """In a forked process: zenoh's objects would wait for threads of the parent when freed."""
+    """Keeps zenoh's objects in a forked process: freeing them waits for the parent's threads."""
     for network in _open_networks:
         for inherited in (network.zenoh, *network._declared):
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(inherited))

@@ -1,4 +1,4 @@
-"""The agent's end of the protocol in Python: one session, and what can go wrong."""
+"""The agent's side of the protocol in Python: one session, with resends and loss detection."""
 
 import contextlib
 import dataclasses
@@ -27,22 +27,22 @@ __all__ = ["Fleet", "RemoteFault", "RemoteRefused", "RemoteSession", "Wanted", "
 
 _RESEND_SECS = 0.5  # then twice as long, and so on
 _RESEND_SECS_MAX = 4.0
-_LOOK_SECS = 0.1  # between looks for a server whose token is gone
-_OPEN_SECS = 60.0  # a server may have to make an environment first
-_CLOSE_SECS = 2.0  # the session ends with its holder's token, too
-# From a restored connection to a reply: a server ends a session whose holder it has lost.
+_LOOK_SECS = 0.1  # between two checks of a server whose token is gone
+_OPEN_SECS = 60.0  # a server may have to create an environment first
+_CLOSE_SECS = 2.0  # without a reply the session still ends, with its holder's token
+# From a restored connection to a reply: a server ends the session of a holder it has lost.
 _RESTORED_SECS = 15.0
 
 
 class RemoteSession:
-    """Requests are numbered and sent again until a reply comes; close() ends the session.
+    """A session: requests are numbered and resent until a reply comes; close() ends the session.
 
-    server: its id. task: what it says of the task. opened: what was asked for.
-    is_lost: no request will be answered any more; a new session is needed.
+    server: the server's id. description: what it offers. task: its description of the task.
+    opened: the session's parameters. is_lost: no request will be answered; open a new session.
     """
 
     def __init__(self, fleet: Fleet, wanted: Wanted, *, is_return: bool = False) -> None:
-        """is_return: the session takes the place of one that is lost."""
+        """is_return: the session replaces a lost one."""
         self._reply_secs = fleet.reply_secs
         self._keys = protocol.Keys(fleet.fleet)
         self._replies: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()  # None: wake up
@@ -65,12 +65,12 @@ class RemoteSession:
         return self.receive()
 
     def send(self, make: Callable[[int], protocol.Request]) -> None:
-        """Sends the next request; make: its number to the request."""
+        """Sends the next request. make: creates it from its sequence number."""
         require_own_process()
         if self.is_lost:
-            raise RemoteFault(f"{self._server}: the session is lost, and reset opens a new one")
+            raise RemoteFault(f"{self._server}: the session is lost; reset opens a new one")
         request = make(self._sequence + 1)
-        # What the lost reply brought is missing: a reward, and the image that tiles are laid on.
+        # A lost reply held a reward, and the image that later tiles change.
         if self._is_unanswered and not isinstance(request, protocol.Reset | protocol.Close):
             raise RemoteFault(
                 f"{self._server}: expected Reset after a request whose reply was not taken, "
@@ -84,12 +84,12 @@ class RemoteSession:
         self._publisher.put(self._request)
 
     def receive(self) -> protocol.Reply:
-        """The reply to the last request; RemoteRefused or RemoteFault if it is none."""
+        """The reply to the last request; RemoteRefused or RemoteFault if the request failed."""
         reply = self._awaited()
         self._answered_at = time.monotonic()
         if isinstance(reply, protocol.Refused):
             self._is_unanswered = False
-            if reply.sequence == 0:  # every request of ours can be read: it is the session's end
+            if reply.sequence == 0:  # our requests are readable, so that it ends the session
                 raise self._lost(f"refused: {protocol.printable(reply.reason)}")
             raise RemoteRefused(protocol.printable(reply.reason))
         if isinstance(reply, protocol.Faulted):
@@ -101,7 +101,7 @@ class RemoteSession:
         return whole
 
     def close(self) -> None:
-        """Ends the session. In a forked process it is the parent's, and stays."""
+        """Ends the session; does nothing in a forked process, because its parent uses it."""
         if not self._network.is_own:
             return
         if not self.is_lost:
@@ -120,7 +120,7 @@ class RemoteSession:
         return RemoteFault(f"{self._server} {reason}")
 
     def _awaited(self) -> protocol.Reply:
-        """Sends the request again until its reply comes, the server is gone or time is up."""
+        """Resends the request until its reply comes, the server is lost or the time is over."""
         wait, deadline = _RESEND_SECS, self._asked_at + self._reply_secs
         while True:
             reply = self._reply_within(min(wait, max(deadline - time.monotonic(), 0.0)))
@@ -145,7 +145,7 @@ class RemoteSession:
                 wait = min(2.0 * max(wait, _RESEND_SECS), _RESEND_SECS_MAX)
 
     def _whole(self, reply: protocol.Reply) -> protocol.Reply:
-        """The reply with its whole image, which a step may bring in parts."""
+        """The reply with its whole image; a Stepped may carry only the tiles that changed."""
         if isinstance(reply, protocol.Stepped):
             transition = reply.transition
             if reply.changed_tiles is not None:
@@ -214,9 +214,10 @@ class RemoteSession:
         self._replies.put(sample.payload.to_bytes())
 
     def _reply_within(self, wait: float) -> protocol.Reply | None:
-        """Late replies to earlier requests are dropped; number 0 is about the session itself.
+        """The next reply to the last request, or about the session itself (number 0).
 
-        None also when the server's token goes: the caller looks whether the server is gone.
+        Late replies to earlier requests are dropped. None after the wait, or when the server's
+        token disappears, so that the caller checks whether the server is lost.
         """
         deadline = time.monotonic() + wait
         while True:
@@ -231,7 +232,7 @@ class RemoteSession:
                 return reply
 
     def _refuse_early_replies(self) -> None:
-        """A reply that is there before its request answers something that was not asked."""
+        """RemoteFault if the server has replied to a request that was not sent yet."""
         while True:
             try:
                 data = self._replies.get_nowait()
@@ -247,7 +248,7 @@ class RemoteSession:
                 )
 
     def _read(self, codec: protocol.Codec[M], data: bytes) -> M:
-        """What cannot be understood is no outcome."""
+        """The decoded message; RemoteFault if it cannot be read."""
         try:
             return codec.decode(data)
         except protocol.CodecError as error:
@@ -255,14 +256,14 @@ class RemoteSession:
 
 
 class ForkedSession(RemoteSession):
-    """In a forked process: the description that the parent found, and a fault for every request.
+    """The session of a forked process: the parent's description, and a fault for every request.
 
-    Gymnasium's AsyncVectorEnv tells what a reset raises in its workers, but not what making an
-    environment raises there.
+    Gymnasium's AsyncVectorEnv reports what a worker's reset raises, but not what the creation of
+    an environment raises there.
     """
 
     def __init__(self, fleet: Fleet, wanted: Wanted) -> None:
-        """ForkedProcess where the parent found no such server and task."""
+        """ForkedProcess if the parent found no such server and task."""
         for found, description in _last_found:
             if found == fleet and wanted.among(description.tasks) is not None:
                 self.is_lost = False
@@ -271,15 +272,15 @@ class ForkedSession(RemoteSession):
         require_own_process()
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Does nothing: the parent owns the session."""
 
 
 def opened(fleet: Fleet, wanted: Wanted) -> RemoteSession:
-    """A new session."""
+    """A new session; a ForkedSession in a process that was forked after zenoh was opened."""
     try:
         return RemoteSession(fleet, wanted)
     except ForkedProcess:
         return ForkedSession(fleet, wanted)
 
 
-_last_found: list[tuple[Fleet, protocol.Description]] = []  # one at most
+_last_found: list[tuple[Fleet, protocol.Description]] = []  # at most one

@@ -1,4 +1,4 @@
-"""Many environments that run in servers elsewhere, stepped at once as a Gymnasium vector."""
+"""RemoteVectorEnv: sessions of several servers as one Gymnasium vector, stepped at once."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from rever_env.arguments import seed_of
 from rever_env.remote import Fields, RemoteEnv, RemoteFault, RemoteRefused
 
-# An attempt to reach a lost server holds all environments up: the next one comes after a time that
-# is longer than the attempt was by this factor.
+# Backoff: an attempt to reach a lost server delays all environments, so that the next attempt
+# starts this many times the attempt's duration later.
 _RETRY_FACTOR = 4.0
 
 
 class RemoteVectorFault(RemoteFault):
-    """Some environments of a vector are lost, with their episodes; the others are not.
+    """Some environments of a vector have lost their episodes; the others are intact.
 
-    faults: what happened, by the environment's index.
-    results: what the call would have returned. Rows of the lost environments have their last
-    observation and the reward NaN, and infos["fault"] has the words.
+    faults: the RemoteFault of each lost environment, by its index.
+    results: what the call would have returned. The rows of lost environments have their last
+    observation, reward NaN, and the message in infos["fault"].
     """
 
     def __init__(self, faults: dict[int, RemoteFault], results: tuple[Any, ...]) -> None:
@@ -33,20 +33,30 @@ class RemoteVectorFault(RemoteFault):
 
 
 class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
-    """Sessions of many servers, stepped at once: every request is out before any reply is read.
+    """num_envs sessions of one or more servers. All requests are sent before any reply is read.
 
-    connect: endpoints, each of a server or a router; environments are assigned to them in turn, by
-    default one to each. task, variant: one for all environments, or a sequence with one for each.
-    Other arguments as for RemoteEnv.
-    autoreset_mode: as in gymnasium.vector, as AutoresetMode or its text. NEXT_STEP: the step after
-    an episode's end begins the next one and ignores its action. SAME_STEP: the last step itself
-    does; the last observation and info are in info["final_obs"] and info["final_info"]. DISABLED:
-    reset with options={"reset_mask": bool (environments,)}.
+    Arguments:
+        connect: endpoints of servers or routers. Environments are assigned to them in turn.
+        num_envs: number of environments. Default: one per endpoint, or as many as the longest
+            sequence of tasks or variants.
+        task, variant: one for all environments, or a sequence with one for each.
+        autoreset_mode: gymnasium.vector.AutoresetMode or its value. NEXT_STEP: the step after the
+            end of an episode resets and ignores its action. SAME_STEP: the last step resets; the
+            last observation and info are in infos["final_obs"] and infos["final_info"]. DISABLED:
+            call reset with options={"reset_mask": bool (num_envs,)}.
+        Other arguments: as for RemoteEnv.
 
-    A server that breaks costs its own environments only: RemoteVectorFault is raised with the
-    results of the others, and the vector goes on. While a server is away, every step raises it
-    anew. With NEXT_STEP and SAME_STEP each step also tries to begin a new episode in the lost
-    environments; with DISABLED, reset does.
+    Observations and actions: those of RemoteEnv, batched along the first axis; instructions are a
+    tuple of str. Rewards: float64 (num_envs,). terminated, truncated: bool (num_envs,). infos: the
+    keys of RemoteEnv as arrays, each with a mask under "_KEY".
+
+    Raises:
+        RemoteVectorFault: some environments lost their episodes. It holds the results of the
+            others, and the vector remains usable. While a server is unreachable, every step raises
+            it again. With NEXT_STEP and SAME_STEP each step tries to reset the lost environments;
+            with DISABLED, reset does.
+        RemoteRefused: a server refused a request.
+        ValueError: invalid arguments or actions; environments with different spaces.
     """
 
     def __init__(
@@ -69,7 +79,8 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
         self.num_envs = max(counts) if num_envs is None else num_envs
         if not endpoints or self.num_envs < 1:
             raise ValueError(
-                f"expected endpoints and environments, got {len(endpoints)} and {self.num_envs}"
+                "expected at least one endpoint and one environment, got "
+                f"{len(endpoints)} and {self.num_envs}"
             )
         try:
             for index in range(self.num_envs):
@@ -101,7 +112,11 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
         self._latest: list[Fields] = [nothing] * self.num_envs
 
     def reset(self, *, seed: Any = None, options: Fields | None = None) -> tuple[Fields, Fields]:
-        """seed: the first of consecutive ones, or a list with one or None for each environment."""
+        """Resets all environments, or those of options["reset_mask"], bool (num_envs,).
+
+        seed: an int, which gives environment i the seed + i, or a sequence with an int or None for
+        each environment. options["layout"]: as in RemoteEnv.reset, for all of them.
+        """
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, np.bool_)))
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
@@ -119,9 +134,9 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Fields, NDArray[Any], NDArray[Any], NDArray[Any], Fields]:
-        """actions: one for each environment. rewards float64, terminated and truncated bool."""
+        """Executes one control step in every environment; see the class for what it returns."""
         if len(actions) != self.num_envs:
-            raise ValueError(f"actions: expected {self.num_envs} of them, got {len(actions)}")
+            raise ValueError(f"actions: expected {self.num_envs}, got {len(actions)}")
         is_manual = self.autoreset_mode == AutoresetMode.DISABLED
         if is_manual and self._ended.any():
             ended = _indices(self._ended)
@@ -155,13 +170,13 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
         return results
 
     def render(self) -> tuple[Any, ...] | None:
-        """The last image of each environment."""
+        """The last image of each environment, uint8 (height, width, 3)."""
         if self.render_mode is None:
             return None
         return tuple(env.render() for env in self.envs)
 
     def call(self, name: str, *arguments: Any, **keywords: Any) -> tuple[Any, ...]:
-        """The attribute of each environment, called if it can be."""
+        """The attribute of each environment; if it is callable, the result of calling it."""
         values = self.get_attr(name)
         return tuple(
             value(*arguments, **keywords) if callable(value) else value for value in values
@@ -172,7 +187,7 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
         return tuple(env.get_wrapper_attr(name) for env in self.envs)
 
     def set_attr(self, name: str, values: Any) -> None:
-        """values: one for each environment as a list or tuple, or one for all."""
+        """Sets an attribute of each environment. values: a list or tuple, or one value for all."""
         rows = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
         if len(rows) != self.num_envs:
             raise ValueError(f"{name}: expected {self.num_envs} values, got {len(rows)}")
@@ -185,7 +200,7 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
             env.close()
 
     def _with_steps(self, call: "_Call", step_infos: dict[int, Fields], infos: Fields) -> Fields:
-        """Adds the infos of steps; with SAME_STEP begins the next episodes of those that ended."""
+        """Adds the infos of steps; with SAME_STEP, resets the environments that ended."""
         is_same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
         ended = _indices(self._ended) if is_same_step else []
         for index, info in sorted(step_infos.items()):
@@ -217,7 +232,7 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
         begun = time.monotonic()
         if begun < self._retry_at.get(endpoint, 0.0):
             raise RemoteFault(
-                f"{endpoint}: the server could not be reached and is tried again later"
+                f"{endpoint}: the server is unreachable; the next attempt follows later"
             )
         try:
             env.send_reset(seed, options)
@@ -242,7 +257,7 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
         return seeds
 
     def _of(self, name: str, value: str | Sequence[str] | None, index: int) -> str | None:
-        """What an argument is for one environment."""
+        """The value of an argument for one environment."""
         if value is None or isinstance(value, str):
             return value
         if len(value) != self.num_envs:
@@ -268,7 +283,7 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
 
 
 class _Call:
-    """One call of all environments: what fails in one keeps nobody from the others' replies."""
+    """One call of all environments. A failure in one does not affect the replies of the others."""
 
     def __init__(self, vector: RemoteVectorEnv) -> None:
         self._vector = vector
@@ -276,7 +291,7 @@ class _Call:
         self._refusals: dict[int, RemoteRefused] = {}
 
     def send(self, indices: list[int], act: Callable[[int], None]) -> None:
-        """Does one half of a request for each environment of which nothing has failed yet."""
+        """Executes one half of a request for each environment that has not failed yet."""
         for index in indices:
             if index in self.faults or index in self._refusals:
                 continue
@@ -291,12 +306,12 @@ class _Call:
     receive = send
 
     def leave_out(self, indices: list[int]) -> None:
-        """Environments whose fault is already known."""
+        """Marks environments whose fault is already known."""
         for index in indices:
             self.faults[index] = RemoteFault("expected reset after a fault, got step")
 
     def finish(self, results: tuple[Any, ...]) -> None:
-        """Raises what went wrong, with the results of the others in a fault."""
+        """Raises what failed; a RemoteVectorFault holds the results of the other environments."""
         if self._refusals:
             index, refusal = next(iter(self._refusals.items()))
             raise RemoteRefused(f"environment {index}: {refusal}") from refusal

@@ -1,4 +1,4 @@
-"""The Bridge tasks as robosuite environments, with its controllers and our WidowX."""
+"""The Bridge tasks as robosuite environments, with robosuite's controllers and our WidowX."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -20,9 +20,9 @@ from rever_env.tasks import Layout, Task
 from rever_env.world import place_objects
 
 CAMERA = "robot0_third_person"
-# robosuite's prefixes for the parts that a task's rules refer to.
+# robosuite's prefixes of the parts that a task's rules name.
 _ROBOT_PREFIX, _GRIPPER_PREFIX = "robot0_", "gripper0_right_"
-# Largest move of a control step in metres and radians; the Bridge tasks' actions stay below.
+# The largest move of a control step in metres and radians, above the bounds of the action space.
 _MOVE_MAX, _TURN_MAX = 0.1, 0.8
 _CONTROLLER = {
     "type": "BASIC",
@@ -44,7 +44,7 @@ _CONTROLLER = {
 
 @dataclass(frozen=True)
 class _Stage:
-    """A running episode as the expert sees it."""
+    """A running episode as the input of the expert."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -59,8 +59,8 @@ class _Stage:
 class BridgeTask(ManipulationEnv):  # type: ignore[misc]
     """One Bridge task in one of its variants.
 
-    begin(layout, seed) is a reset to a layout that can be repeated; reset() draws one from
-    robosuite's own generator. reward: 1 when the task is solved, else 0.
+    begin(layout, seed) resets to a reproducible layout; reset() draws one from robosuite's own
+    generator. reward: 1 if the task is solved, else 0.
     """
 
     task_name = ""
@@ -86,7 +86,7 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         )
 
     def begin(self, layout: int | None, seed: int) -> Any:
-        """The observation at the start of an episode; the same arguments give the same one."""
+        """Begins an episode and returns its observation; equal arguments give equal episodes."""
         self._placement = place(self.task, layout, seed)
         try:
             return self.reset()
@@ -97,18 +97,18 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
         return float(self._check_success())
 
     def judged(self) -> Statistics:
-        """The episode's statistics. Call it once per control step: they have a memory."""
+        """The episode statistics. Call it exactly once per control step: it updates a memory."""
         assert self.memory is not None, "an episode has begun"
         return self.judge.judge(self._data(), self.memory)
 
     def expert_decision(self) -> expert.Decision:
-        """The scripted expert's action, float64 (7,) as in our own worlds, and its reason."""
+        """The scripted expert's action, float64 (7,) as in World, with its subtask."""
         assert self.memory is not None, "an episode has begun"
         stage = _Stage(self.sim.model._model, self._data(), self.task, self.judge, self.memory)
         return expert.decide(self.task, expert.look(stage))
 
     def _data(self) -> mujoco.MjData:
-        """MuJoCo's own, for the rules of the task."""
+        """MuJoCo's data, for the rules of the task."""
         return self.sim.data._data
 
     def _check_success(self) -> bool:
@@ -126,7 +126,7 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
             mujoco_objects=[],
         )
         fit_scene(self.model.root, robot.robot_model, self.task)
-        # The damping of the fingers' drives makes explicit Euler diverge.
+        # Explicit Euler diverges with the damping of the fingers' drives.
         self.model.root.find("option").set("integrator", "implicitfast")
 
     def _setup_references(self) -> None:
@@ -147,7 +147,7 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
             move_commanded_pose(robot)
 
     def _settle(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Lets the objects come to rest while the robot is held, as it has no control yet."""
+        """Lets the objects come to rest while the robot, not controlled yet, is held."""
         settings = self.task.settings
         joints = [model.joint(name) for name in settings.arm_joints + settings.finger_joints]
         positions = [joint.qposadr[0] for joint in joints]
@@ -163,7 +163,7 @@ class BridgeTask(ManipulationEnv):  # type: ignore[misc]
 
 
 def _environment(task: Task) -> str:
-    """Defines the task's class, which registers it in robosuite; returns its name."""
+    """Defines the task's class, which registers it with robosuite; returns its name."""
     name = task.gymnasium_id.removeprefix("rever/").partition("-")[0]
     body = {"task_name": task.name, "__doc__": task.instruction}
     new_class(name, (BridgeTask,), exec_body=lambda namespace: namespace.update(body))
@@ -174,7 +174,7 @@ ENVIRONMENTS = {task.name: _environment(task) for task in tasks.choose(tasks.loa
 
 
 def _renamed(task: Task) -> Task:
-    """The task with robosuite's names of bodies, joints, sites and camera."""
+    """The task with robosuite's names of bodies, joints, sites and the camera."""
     settings = task.settings
 
     def of_gripper(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
-"""Arena, robot and gripper of our scenes as robosuite's models.
+"""Arena, robot and gripper of our scenes as robosuite models.
 
-They are made of the files in assets/, cut at the places where robosuite joins its parts, with
-motors in place of the arm's joint drives, for robosuite's controllers command torques.
+They are derived from the files in assets/, cut where robosuite joins its parts. Motors replace the
+arm's joint drives, because robosuite's controllers command torques.
 """
 
 import copy
@@ -37,15 +37,15 @@ def bridge_arena(task: Task) -> Arena:
         found = mjcf.elements(scene, change)
         if change.element != "camera" and any(one in robot.iter() for one in found):
             raise InvalidReset(
-                f"task {task.id}: robosuite's robot is the same in every task, and the task "
-                f"changes {change.element} {change.name} of it"
+                f"task {task.id}: robosuite needs the same robot in every task, but this task "
+                f"changes its {change.element} {change.name}"
             )
     with _written(_arena(scene)) as path:
         return Arena(path)
 
 
 def fit_scene(model: Element, robot: ManipulatorModel, task: Task) -> None:
-    """Gives robot, camera and lights the poses and settings of the task's scene."""
+    """Sets poses and settings of robot, camera and lights as in the task's scene."""
     scene = _scene(task)
     base, root = _base(scene), robot.worldbody.find("body")
     root.attrib.update({name: base.attrib[name] for name in ("pos", "quat")})
@@ -69,7 +69,7 @@ class WidowXGripper(GripperModel):  # type: ignore[misc]
             super().__init__(path, idn=idn)
 
     def format_action(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The fingers' shares of their range, (2,): -1 closed, +1 open."""
+        """Commands of the two fingers, (2,), in their range: -1 closed, +1 open."""
         assert len(action) == self.dof
         return np.clip(np.repeat(-np.asarray(action, np.float64), 2), -1.0, 1.0)
 
@@ -144,12 +144,12 @@ def _any_task() -> Task:
 
 
 def _any_scene() -> Element:
-    """The robot is the same in every scene, except for its pose: see fit_scene."""
+    """The scene of any task: the robot is the same in all, except for its pose (see fit_scene)."""
     return _scene(_any_task())
 
 
 def _scene(task: Task) -> Element:
-    """A task's scene with the values of its default classes written into each element."""
+    """A task's scene with the values of its default classes written out in each element."""
     scene = mjcf.scene(task)
     classes: dict[str, dict[str, dict[str, str]]] = {}
     for node in scene.findall("default"):
@@ -183,14 +183,14 @@ def _apply(node: Element, of_body: str, classes: dict[str, dict[str, dict[str, s
 
 
 def _robot(scene: Element) -> Element:
-    """From the base to the wrist, with a motor for each joint."""
+    """The arm from base to wrist, with a motor for each joint."""
     base = _base(scene)
     _without_gripper(base)
-    # robosuite's controllers compensate gravity themselves.
+    # robosuite's controllers compensate gravity.
     for body in base.iter("body"):
         body.attrib.pop("gravcomp", None)
     for element in base.iter("joint"):
-        # robosuite adds damping and friction to joints without these attributes, and its controller
+        # robosuite adds damping and friction to joints without these attributes. Its controller
         # does not compensate them: the arm would stop up to 8 % short of the commanded pose.
         element.attrib.update(damping="0", frictionloss="0")
     model = _model("widowx", scene, [base])
@@ -207,13 +207,13 @@ def _robot(scene: Element) -> Element:
             ctrllimited="true",
         )
     _name_geoms(base, "arm")
-    # robosuite's controllers use it as the origin of the arm's frame.
+    # robosuite's controllers use it as the origin of the arm frame.
     ElementTree.SubElement(base, "site", _UNSEEN, name="right_center")
     return model
 
 
 def _gripper(scene: Element) -> Element:
-    """The bar that carries the fingers and everything below it, with the fingers' own drives."""
+    """The bar with the fingers and everything below it, with the fingers' own drives."""
     hand = _without_gripper(_base(scene))
     for body in hand.iter("body"):
         body.attrib.pop("gravcomp", None)
@@ -244,7 +244,7 @@ def _gripper(scene: Element) -> Element:
 
 
 def _arena(scene: Element) -> Element:
-    """Everything except the robot."""
+    """The scene without the robot."""
     bodies = [node for node in _worldbody(scene) if node.get("name") != "base_link"]
     for index, body in enumerate(bodies):
         _name_geoms(body, f"arena_{index}")
@@ -252,7 +252,7 @@ def _arena(scene: Element) -> Element:
 
 
 def _model(name: str, scene: Element, bodies: list[Element]) -> Element:
-    """A model with the materials of its bodies: of two by one name robosuite keeps one."""
+    """A model with the materials of its bodies; robosuite keeps one of two with the same name."""
     model = ElementTree.Element("mujoco", model=name)
     ElementTree.SubElement(model, "compiler", angle="radian", autolimits="true")
     asset = ElementTree.SubElement(model, "asset")
@@ -276,7 +276,7 @@ def _base(scene: Element) -> Element:
 
 
 def _without_gripper(base: Element) -> Element:
-    """Replaces the gripper by robosuite's empty hand, and returns the gripper."""
+    """Replaces the gripper by robosuite's empty hand and returns the gripper."""
     for parent in base.iter("body"):
         for index, child in enumerate(parent):
             if child.get("name") == _HAND:
@@ -298,7 +298,7 @@ def _name_geoms(root: Element, prefix: str) -> None:
 
 @contextmanager
 def _written(model: Element) -> Iterator[str]:
-    """The path of a file with the model, for as long as it is read."""
+    """The path of a temporary file with the model."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.xml"
         ElementTree.ElementTree(model).write(path)

@@ -1,4 +1,4 @@
-"""What robosuite offers: any of its tasks with any of its robots, and the Bridge tasks in it."""
+"""robosuite's tasks with any of its robots, and the Bridge tasks in robosuite."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from rever_env.protocol import Dimension
 from rever_env.robosuite_motion import ARMS_TO_SCALE, is_moved_by_pose
 from rever_env.tasks import TaskId
 
-# What robosuite's documentation says each task is about.
+# Instructions, after robosuite's documentation of each task.
 _INSTRUCTIONS = {
     "Lift": "lift the cube",
     "Stack": "stack the red cube on the green cube",
@@ -31,14 +31,14 @@ _INSTRUCTIONS = {
     "Wipe": "wipe the table",
     "ToolHang": "hang the tool on the frame",
 }
-# Added to a task's version: raised when episodes of the same tasks change here. 1: actions move the
-# commanded pose, and the Bridge tasks' arm has no friction.
+# Added to a task's version; raised when episodes of the same tasks change. 1: actions move the
+# commanded pose, and the arm of the Bridge tasks has no friction.
 _REVISION = 1
 
 
 @dataclass(frozen=True)
 class RobosuiteTask:
-    """A Bridge task in one of its variants, or robosuite's own, whose variants are its robots."""
+    """A Bridge task in a variant, or one of robosuite's own tasks, whose variants are robots."""
 
     name: str
     variant: str
@@ -46,11 +46,11 @@ class RobosuiteTask:
     steps_max: int
     state: tuple[Dimension, ...]
     action: tuple[Dimension, ...]
-    making: Mapping[str, Any]  # for robosuite.make
+    making: Mapping[str, Any]  # arguments of robosuite.make
     control_hz: float
     camera: str = "agentview"
     version: int = 1 + _REVISION
-    layouts: tuple[Any, ...] = ()  # robosuite draws every layout of its own tasks
+    layouts: tuple[Any, ...] = ()  # robosuite draws all layouts of its own tasks
     is_bridge: bool = False
     is_one_arm: bool = True
 
@@ -58,11 +58,11 @@ class RobosuiteTask:
 def offered(
     names: Sequence[str], robots: Sequence[str], steps_max: int, control_hz: float
 ) -> dict[str, RobosuiteTask]:
-    """Every named task with every named robot; InvalidReset for an unknown name.
+    """Each named task with each named robot; InvalidReset for an unknown name.
 
-    robots: ROBOT, or ROBOT+ROBOT for a task of two. A Bridge task has its own robot, horizon and
-    control rate, and may be named with a variant: see tasks.choose. "bridge" is every Bridge task
-    in every variant.
+    robots: ROBOT, or ROBOT+ROBOT for a two-armed task. A Bridge task has its own robot, horizon and
+    control rate, and its name may include a variant: see tasks.choose. "bridge" means all Bridge
+    tasks in all variants.
     """
     robosuite = load_robosuite()
     bridge = tasks.load()
@@ -87,13 +87,13 @@ def offered(
 
 
 def load_robosuite() -> Any:
-    """The package, made to draw with the software renderer whatever the environment says."""
-    # 1.5.2 takes the variable for numbers of EGL devices when it is imported.
+    """Imports robosuite so that it uses the software renderer, whatever the variables say."""
+    # On import, 1.5.2 reads numbers of EGL devices from the variable.
     hidden = os.environ.pop("CUDA_VISIBLE_DEVICES", None)
     try:
         opengl.choose_device_for_other_libraries()
     except RendererUnavailable:
-        pass  # worlds without images need none
+        pass  # worlds without images need no renderer
     try:
         import robosuite
     finally:
@@ -103,7 +103,7 @@ def load_robosuite() -> Any:
 
 
 def _check_rate(control_hz: float, timestep: float) -> None:
-    """robosuite would round the physics steps of a control step down, and run at another rate."""
+    """InvalidReset for a rate that robosuite would change by rounding the physics steps down."""
     steps = 1.0 / (control_hz * timestep) if control_hz > 0.0 else 0.0
     if steps < 0.5 or abs(steps - round(steps)) > 1e-6 * steps:
         raise InvalidReset(
@@ -113,7 +113,7 @@ def _check_rate(control_hz: float, timestep: float) -> None:
 
 
 def _task(name: str, robot: str, steps_max: int, control_hz: float) -> RobosuiteTask:
-    """One arm to scale has the state and the action of a Bridge task; others, robosuite's own."""
+    """State and action: those of a Bridge task for one measured arm, otherwise robosuite's own."""
     making = {"env_name": name, "robots": robot.split("+"), "control_freq": control_hz}
     try:
         environment = load_robosuite().make(
@@ -155,7 +155,7 @@ def _task(name: str, robot: str, steps_max: int, control_hz: float) -> Robosuite
 
 
 def felt(observation: Mapping[str, Any]) -> list[tuple[str, NDArray[np.float64]]]:
-    """The proprioception of each robot, by its name."""
+    """The proprioceptive numbers of each robot."""
     ending = "_proprio-state"
     return [
         (name.removesuffix(ending), np.asarray(observation[name]))
@@ -186,5 +186,5 @@ def bridge_task(task: tasks.Task) -> RobosuiteTask:
 
 
 def simulator() -> str:
-    """robosuite with its version."""
+    """The name and version of robosuite."""
     return f"robosuite {metadata.version('robosuite')}"

@@ -1,4 +1,4 @@
-"""robosuite's environments behind the protocol."""
+"""A robosuite environment as a world of a server."""
 
 import copy
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from rever_env.robosuite_tasks import RobosuiteTask, felt, load_robosuite
 from rever_env.success import success_alone
 from rever_env.world import DOWN, Observation, Transition, broken, silence_warnings
 
-# An object's own values, not what it refers to: numbers, and containers of them.
+# Values of an object that are saved: numbers, and containers of numbers.
 _PLAIN = (np.ndarray, np.generic, float, int, bool, str, type(None))
 
 
@@ -28,10 +28,10 @@ class RobosuiteWorld:
     """One robosuite environment with its default controller.
 
     Any thread may use it, one at a time for all such worlds of a process: robosuite draws from
-    numpy's global generator. One arm is driven as in a Bridge task, in metres and radians in the
-    base's frame (see robosuite_motion); the controller limits a move to 50 mm and 0.5 rad per step,
-    to 100 mm and 0.8 rad in the Bridge tasks. Other robots take robosuite's own actions. Statistics
-    of robosuite's own tasks contain success alone.
+    numpy's global generator. One measured arm takes actions as in a Bridge task, in metres and
+    radians in the base frame (see robosuite_motion); the controller limits a move to 50 mm and
+    0.5 rad per step, in the Bridge tasks to 100 mm and 0.8 rad. Other robots take robosuite's own
+    actions. Statistics of robosuite's own tasks have only success.
     """
 
     def __init__(self, task: RobosuiteTask, image_height: int, image_width: int) -> None:
@@ -56,15 +56,15 @@ class RobosuiteWorld:
                     use_camera_obs=has_image,
                     camera_names=task.camera,
                     ignore_done=True,
-                    # Some models are random, too (a cube's size): every world has the same one,
-                    # since a new one at each reset would cost a second.
+                    # Some models are random, such as a cube's size. All worlds have the same one,
+                    # because a new model at each reset would take a second.
                     hard_reset=False,
                     seed=0,
                     **cameras,
                 )
-        except Exception as error:  # robosuite raises errors of any type
+        except Exception as error:  # robosuite raises errors of many types
             raise Fault(
-                f"robosuite cannot make {task.name}: {type(error).__name__}: {error}"
+                f"robosuite cannot create {task.name}: {type(error).__name__}: {error}"
             ) from error
         self._robot = self._environment.robots[0]
         if task.is_one_arm:
@@ -75,7 +75,7 @@ class RobosuiteWorld:
         self._last: Observation | None = None
 
     def reset(self, *, layout: int | None, seed: int) -> Observation:
-        """The same seed gives the same bytes: robosuite's generators are set again in place."""
+        """The same seed gives the same bytes: the state of robosuite's generators is replaced."""
         environment = self._environment
         check_layout(self.task.name, layout, len(self.task.layouts))
         with self._drawing():
@@ -91,16 +91,16 @@ class RobosuiteWorld:
         return self._observe(observation)
 
     def _seed(self, seed: int) -> None:
-        # 1.5.2 ignores the seed that its Gymnasium wrapper is given; the layout sampler keeps
-        # the generator object, so that its state is what must be replaced.
+        # 1.5.2 ignores the seed of its Gymnasium wrapper. The layout sampler holds the generator
+        # object, so that its state must be replaced in place.
         state = np.random.default_rng(seed).bit_generator.state
         self._environment.rng.bit_generator.state = state
         np.random.seed(seed % 2**32)
 
     def step(self, action: NDArray[np.float64]) -> Transition:
-        """action: float64, as the task describes.
+        """Executes one control step. action: float64, as the task describes.
 
-        For one arm (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open).
+        One measured arm, (7,): dx dy dz (m), rotation vector (rad), gripper (+1 open).
         """
         steps = self._running()
         if steps >= self.task.steps_max:
@@ -137,7 +137,7 @@ class RobosuiteWorld:
             raise PhysicsDiverged(f"physics of {self.task.name} at step {steps}: {words}")
 
     def _judged(self) -> Statistics:
-        """Of its own tasks robosuite knows success alone."""
+        """Statistics; of robosuite's own tasks only success is known."""
         if self.task.is_bridge:
             statistics: Statistics = self._environment.judged()
             return statistics
@@ -148,7 +148,7 @@ class RobosuiteWorld:
     def save(self) -> Any:
         """All of MuJoCo's data, and the plain values of all robosuite objects with a memory.
 
-        Not MuJoCo's state alone: robosuite continues from poses that are one physics step old.
+        MuJoCo's state is not enough: robosuite continues from poses that are one physics step old.
         """
         self._running()
         data = copy.copy(self._environment.sim.data._data)
@@ -174,7 +174,7 @@ class RobosuiteWorld:
         return self.expert_decision().action
 
     def expert_decision(self) -> Decision:
-        """The scripted expert's action with the reason for it; only Bridge tasks have one."""
+        """The scripted expert's action with its subtask; only Bridge tasks have an expert."""
         if not self.task.is_bridge:
             raise InvalidAction(f"task {self.task.name} has no scripted expert")
         self._running()
@@ -182,13 +182,13 @@ class RobosuiteWorld:
         return decision
 
     def close(self) -> None:
-        # Otherwise robosuite would free the buffers of whatever OpenGL context is current.
+        # Otherwise robosuite would free buffers of another current OpenGL context.
         with self._drawing():
             self._environment.close()
 
     @contextmanager
     def _drawing(self) -> Iterator[None]:
-        """Inside, this world's OpenGL context is current, which robosuite takes for granted."""
+        """Makes this world's OpenGL context current inside the block, as robosuite assumes."""
         with opengl.preserved_context():
             if self._size != (0, 0):
                 self._environment.sim._render_context_offscreen.gl_ctx.make_current()
@@ -200,7 +200,7 @@ class RobosuiteWorld:
         return self._steps
 
     def _parts(self) -> list[Any]:
-        """The objects that keep something from one step to the next."""
+        """The robosuite objects with a memory."""
         parts = [self._environment]
         for robot in self._environment.robots:
             parts += [robot, robot.composite_controller]
@@ -225,7 +225,7 @@ class RobosuiteWorld:
         return self._last
 
     def _state(self) -> NDArray[np.float32]:
-        """x y z (m) roll pitch yaw (rad) in the base frame, pad 0, gripper opening 0 to 1."""
+        """x y z (m) roll pitch yaw (rad) in the base frame, 0, gripper opening 0 to 1."""
         data, model = self._environment.sim.data, self._environment.sim.model
         base = model.body_name2id(self._robot.robot_model.root_body)
         site = model.site_name2id(
@@ -241,7 +241,7 @@ class RobosuiteWorld:
         return np.array([*pose, 0.0, self._opening()], np.float32)
 
     def _opening(self) -> float:
-        """Mean of the gripper's joints, each from its closed end (0) to its open one (1)."""
+        """The mean opening of the gripper's joints, 0 (closed) to 1 (open)."""
         model, data = self._environment.sim.model, self._environment.sim.data
         names = self._robot.gripper[self._robot.arms[0]].joints
         shares = []
@@ -253,7 +253,7 @@ class RobosuiteWorld:
 
 
 def _buffers(value: Any) -> list[Any]:
-    """robosuite's buffers of recent values, alone or by arm."""
+    """robosuite's buffers of recent values, single or by arm."""
     values = list(value.values()) if isinstance(value, dict) else [value]
     return [one for one in values if type(one).__module__.startswith("robosuite.utils.buffers")]
 

@@ -1,7 +1,7 @@
-"""Sessions over zenoh, all stepped by one thread: the one that owns the rendering contexts.
+"""The environment server: sessions over zenoh, all stepped by the simulation thread.
 
-callback -> inbox -> simulation thread -> session -> outbox: neither zenoh's threads nor the
-simulation thread wait for a peer.
+zenoh callback -> inbox -> simulation thread -> session -> outbox. Neither zenoh's threads nor the
+simulation thread block on a peer. The simulation thread owns the rendering contexts.
 """
 
 import logging
@@ -29,16 +29,18 @@ from rever_env.worlds import UnknownTask, Worlds
 _log = logging.getLogger(__name__)
 
 _BEAT_SECS = 0.5
-_HOLDER_SECS_MAX = 10.0  # a session without its holder's token: the link may come back
-_CLOSED_SECS_MAX = 10.0  # a closed session still answers: its last reply may have been lost
+_HOLDER_SECS_MAX = 10.0  # a session outlives its holder's token so long: the link may return
+_CLOSED_SECS_MAX = 10.0  # a closed session answers so long: its last reply may have been lost
 
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """fleet: peers see each other only within the same one.
+    """Options of a server.
 
-    whole_images: a step's image is not compared with the last one to send what changed only. Where
-    nothing leaves the machine, comparing takes longer than it saves.
+    fleet: namespace; peers see each other only within the same fleet.
+    sessions_max: maximum number of concurrent sessions.
+    whole_images: send whole images instead of changed tiles. Over Unix sockets the comparison of
+    images takes longer than it saves.
     """
 
     fleet: str = "local"
@@ -48,7 +50,7 @@ class ServerOptions:
 
 @dataclass
 class _Lease:
-    """A session with what zenoh holds for it. zenoh's threads write holder."""
+    """A session and its zenoh declarations. zenoh's threads write `holder`."""
 
     name: str
     opened_for: str
@@ -61,7 +63,7 @@ class _Lease:
     gone_at: float = 0.0
 
     def on_token(self, sample: Any) -> None:
-        """The holder's liveliness token came or went."""
+        """The holder's liveliness token appeared or disappeared."""
         if sample.kind == zenoh.SampleKind.PUT:
             self.holder = "alive"
         elif self.holder == "alive":
@@ -70,9 +72,9 @@ class _Lease:
 
 
 class Server:
-    """run() serves until stop is set, in the thread that calls it.
+    """An environment server. run() serves in the calling thread until `stop` is set.
 
-    ValueError for options or worlds that the protocol has no room for.
+    ValueError for options or worlds beyond the protocol's limits.
     """
 
     def __init__(self, network: zenoh.Session, worlds: Worlds, options: ServerOptions) -> None:
@@ -89,10 +91,10 @@ class Server:
         self._ended_steps = 0
         self._inbox = Inbox()
         self._answers = Answers()
-        self._description()  # worlds that cannot be described are refused now
+        self._description()  # raises now for worlds that cannot be described
 
     def run(self, stop: threading.Event, ready: Callable[[str], None]) -> None:
-        """Declares everything, the liveliness token last; then works until stop is set."""
+        """Declares everything, the liveliness token last; serves until `stop` is set."""
         declared: list[Any] = [
             self._queryable(self._keys.describe(self.id), self._describe),
             self._queryable(self._keys.open(self.id), self._open),
@@ -128,9 +130,9 @@ class Server:
                 work()
 
     def _queryable(self, key: str, answer: Callable[[Any], bytes]) -> Any:
-        """Leaves the queries on key to the simulation thread.
+        """Queues the queries on this key for the simulation thread.
 
-        It refuses what is too large and drops what is too much.
+        Refuses queries that are too large, and drops queries when the queue is full.
         """
 
         def on_query(query: Any) -> None:
@@ -190,7 +192,7 @@ class Server:
         return protocol.OPENING.encode(answer)
 
     def _lease(self, opened: protocol.Open) -> str:
-        """A new session; everything that hears its requests stands when this returns."""
+        """A new session. Its subscriptions exist when this returns."""
         session = Session(opened, self._worlds, whole_images=self._options.whole_images)
         name = secrets.token_hex(8)
         publisher = self._network.declare_publisher(
@@ -252,17 +254,17 @@ class Server:
         return protocol.Heartbeat(self.id, self._sessions(), steps, resident_bytes())
 
     def _sessions(self) -> int:
-        """Sessions in use."""
+        """The number of open sessions."""
         return sum(not lease.session.closed for lease in self._leases.values())
 
 
 def _direct(callback: Callable[[Any], None]) -> Any:
-    """Called by zenoh's own thread, which a callback that only hands on may hold up."""
+    """A callback on zenoh's own thread, for callbacks that return at once."""
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def resident_bytes() -> int:
-    """Memory that this process holds; its peak where the system does not tell the present."""
+    """Resident memory of this process; its peak on systems that do not report the present."""
     if sys.platform == "linux":
         with open("/proc/self/statm", "rb") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -272,7 +274,7 @@ def resident_bytes() -> int:
 
 
 def metadata_version() -> str:
-    """This package's version; a checkout that is not installed says so."""
+    """The version of the installed package; "checkout" if it is not installed."""
     try:
         return metadata.version("rever_env")
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""The serve subcommand: its arguments, the network it opens, and how it ends."""
+"""The serve subcommand: arguments, network, and shutdown."""
 
 import argparse
 import json
@@ -19,12 +19,12 @@ from rever_env.protocol import limits
 if TYPE_CHECKING:
     from rever_env.worlds import Worlds
 
-_FINISH_SECS_MAX = 10.0  # a wedged simulation is given up after that
+_FINISH_SECS_MAX = 10.0  # timeout for the simulation thread at shutdown
 _CLOSE_SECS_MAX = 3.0
 _PARENT_POLL_SECS = 0.5
-_CONGESTION_MICROSECONDS = 60_000_000  # a slow reader holds a message up; it does not cost the link
-_ENVELOPE_BYTES = 65_536  # what zenoh adds to a body
-_SOURCE = re.compile(r"\s+at \S+\.rs:\d+\.?")  # where zenoh was built tells users nothing
+_CONGESTION_MICROSECONDS = 60_000_000  # a slow reader delays a message; its link stays open
+_ENVELOPE_BYTES = 65_536  # zenoh's overhead per message
+_SOURCE = re.compile(r"\s+at \S+\.rs:\d+\.?")  # source lines of zenoh, of no use in a message
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=endpoint,
         metavar="ENDPOINT",
-        help="a router or an agent to connect to, such as tcp/127.0.0.1:7447; repeatable",
+        help="connect to a router or an agent, such as tcp/127.0.0.1:7447; repeatable",
     )
     parser.add_argument(
         "--listen",
@@ -43,13 +43,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=endpoint,
         metavar="ENDPOINT",
-        help="where to listen, such as tcp/127.0.0.1:7448; every peer that reaches it is trusted; "
+        help="listen here, such as tcp/127.0.0.1:7448; every peer that can connect is trusted; "
         "repeatable",
     )
     parser.add_argument(
         "--multicast",
         action="store_true",
-        help="discover peers by multicast; without --listen, listen on every interface",
+        help="discover peers by multicast; without --listen, listen on all interfaces",
     )
     parser.add_argument(
         "--fleet",
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=session_count,
         default=16,
         metavar="COUNT",
-        help="largest number of sessions open at the same time (default: 16)",
+        help="maximum number of concurrent sessions (default: 16)",
     )
     parser.add_argument(
         "--exit-with-parent",
@@ -71,14 +71,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=os.getppid(),
         metavar="PID",
-        help="exit when the process with this id (default: the current parent) is no longer the "
-        "parent of this one",
+        help="exit when the parent process with this id ends (default: the current parent)",
     )
     parser.add_argument(
         "--id-file",
         type=Path,
         metavar="FILE",
-        help="write the server's id into this file when it is ready, for `health`",
+        help="write the server's id to this file when it is ready, for `health --id-file`",
     )
     simulators.add_arguments(parser)
     parser.set_defaults(run=serve)
@@ -91,25 +90,24 @@ class Endpoints:
     connect: tuple[str, ...]
     listen: tuple[str, ...]
     multicast: bool
-    # How long a client waits for the router or agent that it is told to connect to.
-    wait_secs: float = 30.0
+    wait_secs: float = 30.0  # timeout of a client's connection
 
     @property
     def are_local(self) -> bool:
-        """Whether all ways lead through the file system, to this machine alone."""
-        ways = (*self.connect, *self.listen)
-        return not self.multicast and all(way.startswith("unixsock-stream/") for way in ways)
+        """Whether all endpoints are Unix sockets, which only this machine can reach."""
+        endpoints = (*self.connect, *self.listen)
+        return not self.multicast and all(one.startswith("unixsock-stream/") for one in endpoints)
 
     def configuration(self, message_bytes_max: int = limits.MESSAGE_BYTES_MAX) -> str:
-        """zenoh's configuration in JSON. Larger messages are dropped as they arrive."""
+        """zenoh's configuration in JSON. zenoh drops larger messages on receipt."""
         link = {"rx": {"max_message_size": message_bytes_max + _ENVELOPE_BYTES}}
         wait = {"wait_before_close": _CONGESTION_MICROSECONDS}
         queue = {"congestion_control": {"block": wait}}
-        # Left out, this is a free port on every interface: what others find by multicast.
+        # Without this key zenoh listens on a free port of every interface, for multicast discovery.
         by_multicast = self.multicast and not self.listen
         listen = {} if by_multicast else {"listen": {"endpoints": self.listen}}
-        # A router forwards between its clients, not between its peers, which it takes for linked.
-        # And a program with one way out and no way in needs no more than a client does.
+        # A router forwards between its clients, but not between its peers, because it assumes that
+        # peers are linked directly. One outgoing connection and no listener make a client.
         is_client = len(self.connect) == 1 and not self.listen and not self.multicast
         return json.dumps(
             {
@@ -137,14 +135,14 @@ class Endpoints:
 
 
 def cause(error: Exception) -> str:
-    """An error of zenoh without the places in its source."""
+    """The message of a zenoh error without source locations."""
     return _SOURCE.sub("", str(error))
 
 
 def serve(arguments: argparse.Namespace) -> int:
-    """Serves until a signal comes or the parent is gone.
+    """Serves until SIGTERM, SIGINT or the end of the parent process; returns the exit status.
 
-    Prints a line that begins with `ready {server id}` when it can serve.
+    Prints one line that begins with `ready {server id}` when it accepts sessions.
     """
     import zenoh
 
@@ -197,8 +195,8 @@ def serve(arguments: argparse.Namespace) -> int:
     _wait(stop, arguments.exit_with_parent)
     thread.join(_FINISH_SECS_MAX)
     if thread.is_alive():
-        # It holds the rendering contexts: no orderly end is left.
-        logging.error("the simulation did not end within %.0f s", _FINISH_SECS_MAX)
+        # It holds the rendering contexts, so that an orderly shutdown is impossible.
+        logging.error("the simulation thread did not end within %.0f s", _FINISH_SECS_MAX)
         os._exit(1)
     closing = threading.Thread(target=network.close, name="closing", daemon=True)
     closing.start()
@@ -211,16 +209,19 @@ def serve(arguments: argparse.Namespace) -> int:
 
 
 def _wrong_usage(arguments: argparse.Namespace) -> str:
-    """What is wrong with the arguments together, if anything is."""
+    """Why the combination of arguments is invalid; empty if it is valid."""
     if not (arguments.connect or arguments.listen or arguments.multicast):
         return "expected --connect, --listen or --multicast, got none"
     if arguments.id_file and not arguments.id_file.absolute().parent.is_dir():
-        return f"--id-file {arguments.id_file}: expected it in a folder that exists"
+        return (
+            f"--id-file {arguments.id_file}: expected an existing folder, got "
+            f"{arguments.id_file.absolute().parent}"
+        )
     return ""
 
 
 def _offer(worlds: "Worlds") -> str:
-    """The tasks, by name, and the number of their variants if there are several."""
+    """The names of the tasks, with the number of their variants if there are several."""
     variants: dict[str, int] = {}
     for task, _ in worlds.tasks:
         variants[task] = variants.get(task, 0) + 1
@@ -232,5 +233,5 @@ def _offer(worlds: "Worlds") -> str:
 def _wait(stop: threading.Event, parent: int | None) -> None:
     while not stop.wait(_PARENT_POLL_SECS):
         if parent is not None and os.getppid() != parent:
-            logging.info("the parent process %d is gone", parent)
+            logging.info("the parent process %d has ended", parent)
             stop.set()

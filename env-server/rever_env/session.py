@@ -1,4 +1,4 @@
-"""One leased session: its numbered requests, its world, its saved states."""
+"""One session of a server: its numbered requests, its world, its saved states."""
 
 import logging
 import time
@@ -12,15 +12,15 @@ from rever_env.worlds import AnyWorld, Key, UnknownTask, Worlds
 
 _log = logging.getLogger(__name__)
 
-_SIMULATOR_US_MAX = 2**32 - 1  # what the reply has room for: over an hour
+_SIMULATOR_US_MAX = 2**32 - 1  # the limit of the field, over an hour
 
 
 class _Wrong(Exception):
-    """The request is wrong at this moment; the world is unchanged."""
+    """The request is invalid at this moment; the world is unchanged."""
 
 
 class Session:
-    """Answers requests exactly once each. Use it in the thread that renders."""
+    """Executes each request exactly once. Use it only in the simulation thread."""
 
     def __init__(
         self, opened: protocol.Open, worlds: Worlds, *, whole_images: bool = False
@@ -40,7 +40,7 @@ class Session:
         self._world: AnyWorld | None = worlds.take(self._key)
 
     def answer(self, data: bytes) -> bytes | None:
-        """The reply's bytes; None when the request is older than the last one."""
+        """The bytes of the reply; None for a request that is older than the last one."""
         refusal = None
         try:
             request = protocol.REQUEST.decode(data)
@@ -65,7 +65,7 @@ class Session:
         return reply
 
     def end(self) -> None:
-        """Gives the world back."""
+        """Closes the session and returns the world to the pool."""
         self.closed = True
         self._running = False
         self._slots.clear()
@@ -82,7 +82,7 @@ class Session:
         except world.RendererUnavailable as error:
             return self._fault(sequence, protocol.FaultKind.RENDERER_UNAVAILABLE, str(error))
         except Exception as error:
-            # A defect must reach the agent as a fault: silence or a default would become a label.
+            # A bug must reach the agent as a fault: silence or a default would become a label.
             _log.exception("request %d of a session failed", sequence)
             return self._fault(
                 sequence, protocol.FaultKind.INTERNAL, f"{type(error).__name__}: {error}"
@@ -129,7 +129,7 @@ class Session:
         return observation
 
     def _change(self, key: Key, request: protocol.Reset) -> world.Observation:
-        """Resets another world and takes it in place of this one, which a refusal leaves alone."""
+        """Resets another world, which replaces this one; a refusal leaves this one unchanged."""
         fresh = self._worlds.take(key)
         try:
             observation = fresh.reset(layout=request.layout, seed=request.seed)
@@ -138,14 +138,14 @@ class Session:
             raise
         except Exception:
             self._release()
-            self._world, self._key = fresh, key  # to be closed with the fault
+            self._world, self._key = fresh, key  # closed by the fault
             raise
         self._release()
         self._world, self._key = fresh, key
         return observation
 
     def _fault(self, sequence: int, kind: protocol.FaultKind, reason: str) -> bytes:
-        """The world may be broken for good: the next Reset gets another one."""
+        """Discards the world, which may be broken: the next Reset takes another one."""
         self._running = False
         self._slots.clear()
         if self._world is not None:
@@ -184,7 +184,7 @@ class Session:
     def _observation(
         self, observation: world.Observation, pixels: bytes | None = None
     ) -> protocol.Observation:
-        """pixels: in place of the whole image's."""
+        """The observation as a message. pixels: those of the changed tiles; None for all."""
         height, width, _ = observation.image.shape
         expert_action = None
         if self._opened.expert and self._world is not None:
@@ -206,6 +206,6 @@ def refused(sequence: int, reason: str) -> bytes:
 
 
 def _short(reason: str) -> str:
-    """Within the limit on texts, whatever the exception said."""
+    """The text, truncated to the protocol's limit."""
     limit = protocol.limits.TEXT_BYTES_MAX
     return reason.encode()[:limit].decode(errors="ignore")

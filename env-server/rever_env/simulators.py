@@ -18,42 +18,45 @@ _ROBOTS, _CONTROL_HZ, _HORIZON = ("Panda",), 20.0, 500
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declares the options of simulators other than our own."""
+    """Declares the options that choose tasks and simulator."""
     group = parser.add_argument_group(
-        "simulators", "Without --robosuite or --gymnasium the Bridge tasks in MuJoCo are served."
+        "simulators", "Default: all Bridge tasks in MuJoCo, in all variants."
     )
     kinds = group.add_mutually_exclusive_group()
     kinds.add_argument(
         "--tasks",
         nargs="+",
         metavar="TASK",
-        help="Bridge tasks: TASK, TASK/VARIANT or TASK/all (default: every task and variant)",
+        help="serve these Bridge tasks: TASK, TASK/VARIANT or TASK/all (default: all)",
     )
     kinds.add_argument(
         "--robosuite",
         nargs="+",
         metavar="TASK",
-        help="tasks of robosuite, and Bridge tasks in it (named as in --tasks, or bridge: all)",
+        help="serve tasks of robosuite, such as Lift, or Bridge tasks in robosuite, named as for "
+        "--tasks (bridge: all of them)",
     )
-    kinds.add_argument("--gymnasium", nargs="+", metavar="ID", help="environments of Gymnasium")
+    kinds.add_argument(
+        "--gymnasium", nargs="+", metavar="ID", help="serve these Gymnasium environments"
+    )
     group.add_argument(
         "--horizon",
         type=count,
         metavar="STEPS",
-        help="control steps of episodes of robosuite's own tasks and of Gymnasium ids without a "
-        f"limit (default: {_HORIZON})",
+        help="truncate episodes of robosuite's own tasks, and of Gymnasium ids without a limit, "
+        f"after so many control steps (default: {_HORIZON})",
     )
     _add_robosuite_arguments(parser)
     _add_gymnasium_arguments(parser)
 
 
 def _add_robosuite_arguments(parser: argparse.ArgumentParser) -> None:
-    robosuite = parser.add_argument_group("options of --robosuite, for its own tasks")
+    robosuite = parser.add_argument_group("options of --robosuite, for robosuite's own tasks")
     robosuite.add_argument(
         "--robots",
         nargs="+",
         metavar="ROBOT",
-        help="each task is offered with each of them; ROBOT+ROBOT for two-armed tasks "
+        help="offer each task with each of these robots; ROBOT+ROBOT for two-armed tasks "
         f"(default: {' '.join(_ROBOTS)})",
     )
     robosuite.add_argument(
@@ -71,31 +74,37 @@ def _add_gymnasium_arguments(parser: argparse.ArgumentParser) -> None:
         dest="imports",
         nargs="+",
         metavar="PACKAGE",
-        help="packages that register the ids when they are imported",
+        help="import these packages first, to register the ids",
     )
     gymnasium.add_argument(
-        "--arguments", type=json_object, metavar="JSON", help="arguments of gymnasium.make"
+        "--arguments",
+        type=json_object,
+        metavar="JSON",
+        help="keyword arguments for gymnasium.make, as a JSON object",
     )
     gymnasium.add_argument(
-        "--wrapper", metavar="MODULE:CLASS", help="applied to each environment, outermost"
+        "--wrapper",
+        metavar="MODULE:CLASS",
+        help="apply this wrapper to each environment, as the outermost one",
     )
     gymnasium.add_argument(
         "--image-key",
         metavar="KEY",
-        help="the image of a Dict observation, as in images.front (default: the first one)",
+        help="the image in a Dict observation, such as images.front (default: the first image)",
     )
     gymnasium.add_argument(
         "--instruction-key",
         metavar="KEY",
-        help="the instruction, a Text of a Dict observation (default: the first one; without one, "
-        "the environment's task_description, instruction or language_instruction, then its id)",
+        help="the instruction, a Text in a Dict observation (default: the first Text; if there is "
+        "none, the environment's attribute task_description, instruction or language_instruction; "
+        "else its id)",
     )
     gymnasium.add_argument(
         "--state-keys",
         nargs="+",
         metavar="KEY",
         help="the parts of a Dict observation that form the state, in this order (default: all "
-        "numbers)",
+        "numeric parts)",
     )
 
 
@@ -104,13 +113,13 @@ class UnusedOption(ValueError):
 
 
 def make_worlds(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
-    """The worlds that the options ask for; UnusedOption when one of them would do nothing."""
+    """The worlds that the options choose; UnusedOption if an option would have no effect."""
     _check_used(arguments)
     if arguments.gymnasium:
         return _gymnasium(arguments, idle_max)
     reason = opengl.unavailable()
     if reason:
-        _log.warning("images cannot be rendered, sessions with images are refused: %s", reason)
+        _log.warning("cannot render images; sessions with images are refused: %s", reason)
     if arguments.robosuite:
         return _robosuite(arguments, idle_max)
     from rever_env import tasks
@@ -142,7 +151,7 @@ def _gymnasium(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
     try:
         opengl.choose_device_for_other_libraries()
     except RendererUnavailable as error:
-        _log.warning("OpenGL is unavailable to the environments: %s", error)
+        _log.warning("OpenGL is not available to the environments: %s", error)
     from rever_env import gymnasium_tasks, gymnasium_trial, gymnasium_world
     from rever_env.worlds import Worlds
 
@@ -157,7 +166,7 @@ def _gymnasium(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
         gymnasium_tasks.Keys(arguments.image_key, arguments.instruction_key, state_keys),
     )
     if arguments.horizon and all(map(gymnasium_tasks.has_limit, offered)):
-        raise UnusedOption("--horizon has no effect: every environment has a limit of its own")
+        raise UnusedOption("--horizon has no effect: every environment has its own step limit")
     for name, task in offered.items():
         offered[name], warnings = gymnasium_trial.tried(task)
         for words in warnings:
@@ -173,21 +182,21 @@ def _gymnasium(arguments: argparse.Namespace, idle_max: int) -> "Worlds":
 
 
 def _check_used(arguments: argparse.Namespace) -> None:
-    """An option that is accepted acts."""
+    """UnusedOption for an option that the chosen simulator ignores."""
     from rever_env import tasks
 
     bridge = {tasks.BRIDGE, *(task.name for task in tasks.load().values())}
     named = {tasks.TaskId.parse(name).task for name in arguments.robosuite or ()}
     has_own_robosuite = bool(named - bridge)
     is_gymnasium = bool(arguments.gymnasium)
-    of_robosuite = (has_own_robosuite, "tasks of robosuite's own (the Bridge tasks have their own)")
+    of_robosuite = (has_own_robosuite, "--robosuite and one of robosuite's own tasks")
     of_gymnasium = (is_gymnasium, "--gymnasium")
     for option, (is_used, wanted) in {
         "robots": of_robosuite,
         "control_hz": of_robosuite,
         "horizon": (
             has_own_robosuite or is_gymnasium,
-            "--gymnasium or tasks of robosuite's own (the Bridge tasks have their own)",
+            "--gymnasium, or --robosuite and one of robosuite's own tasks",
         ),
         "imports": of_gymnasium,
         "arguments": of_gymnasium,

@@ -1,4 +1,4 @@
-"""Snapshots: the whole state of an episode as bytes, bit-exact."""
+"""Snapshots: the complete state of an episode as bytes, bit-exact."""
 
 import hashlib
 import struct
@@ -17,7 +17,7 @@ _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 class InvalidSnapshot(Fault):
-    """The bytes are no snapshot of this task."""
+    """The bytes are not a snapshot of this task."""
 
 
 def pack(
@@ -27,7 +27,7 @@ def pack(
     controller: Controller,
     progress: tuple[Memory, int],
 ) -> bytes:
-    """Integration state (with warm start), commanded pose, statistics and step count."""
+    """Packs integration state (with warm start), commanded pose, statistics and step count."""
     memory, steps = progress
     state = np.zeros(mujoco.mj_stateSize(model, _STATE))
     mujoco.mj_getState(model, data, state, _STATE)
@@ -63,9 +63,9 @@ def unpack(
     data: mujoco.MjData,
     controller: Controller,
 ) -> tuple[Memory, int]:
-    """Puts the state into data and controller; returns statistics' memory and step count.
+    """Sets the state of data and controller; returns the memory of the statistics and step count.
 
-    Whoever calls it brings what follows from the state up to date.
+    The caller must update what depends on the state, such as contacts.
     """
     size = mujoco.mj_stateSize(model, _STATE)
     floats_count = size + 17 + 2 * len(task.distractors)

@@ -1,4 +1,4 @@
-"""The parts of Gymnasium's spaces: numbers with the protocol's dimensions, images and texts."""
+"""Parts of Gymnasium spaces: numbers, described as in the protocol, images and texts."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,14 +12,14 @@ from rever_env.protocol import Dimension
 
 @dataclass(frozen=True)
 class Part:
-    """One space without parts inside an observation. keys: the way to it from outside."""
+    """A space without parts in an observation space. keys: its path from the outermost one."""
 
     keys: tuple[Any, ...]
     space: spaces.Space[Any]
 
     @property
     def name(self) -> str:
-        """Its keys, joined by points; empty for the whole observation."""
+        """The keys, joined by dots; empty for the whole observation."""
         return ".".join(str(key) for key in self.keys)
 
     @property
@@ -31,33 +31,33 @@ class Part:
         return isinstance(self.space, spaces.Text)
 
     def is_within(self, name: str) -> bool:
-        """Whether it is the part of that name or lies inside it."""
+        """Whether the part has this name or is inside the one with this name."""
         return self.name == name or self.name.startswith(f"{name}.")
 
     def of(self, observation: Any) -> Any:
-        """Its value in the observation."""
+        """The value of the part in an observation."""
         for key in self.keys:
             observation = observation[key]
         return observation
 
     def dimensions(self, name: str) -> tuple[Dimension, ...]:
-        """Of a part of numbers; name: of the observation."""
+        """The dimensions of a numeric part. name: the name of the observation."""
         return dimensions_of(self.space, f"{name}.{self.name}" if self.keys else name)
 
     def numbers(self, observation: Any) -> list[float]:
-        """Of a part of numbers, in the order of its dimensions."""
+        """The numbers of a numeric part, in the order of its dimensions."""
         return numbers_of(self.space, self.of(observation))
 
 
 def parts_of(space: spaces.Space[Any], keys: tuple[Any, ...] = ()) -> list[Part]:
-    """All parts of an observation, in the order of its space."""
+    """All parts of an observation space, in its order."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         return [part for key, inner in _parts(space) for part in parts_of(inner, (*keys, key))]
     return [Part(keys, space)]
 
 
 def is_image(space: spaces.Space[Any]) -> bool:
-    """A colour image: uint8, rows, columns, red green blue."""
+    """Whether it is an RGB image: uint8 (rows, columns, 3)."""
     return (
         isinstance(space, spaces.Box)
         and space.dtype == np.uint8
@@ -67,9 +67,9 @@ def is_image(space: spaces.Space[Any]) -> bool:
 
 
 def dimensions_of(space: spaces.Space[Any], name: str) -> tuple[Dimension, ...]:
-    """The numbers that a value of the space consists of; ValueError where their count varies.
+    """The numbers of a value of the space; ValueError if their count is not fixed.
 
-    Images and texts have none. name: of the space; parts are called name.part or name[index].
+    Images and texts have none. name: the name of the space; its parts are name.part or name[index].
     """
     if is_image(space) or isinstance(space, spaces.Text):
         return ()
@@ -117,7 +117,7 @@ def numbers_of(space: spaces.Space[Any], value: Any) -> list[float]:
 
 
 def value_of(space: spaces.Space[Any], numbers: NDArray[np.float64]) -> Any:
-    """The value of an action space that is made of these numbers: numbers_of backwards."""
+    """The value of an action space from its numbers: the inverse of numbers_of."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         values, start = {}, 0
         for part, inner in _parts(space):
@@ -137,6 +137,6 @@ def _parts(space: "spaces.Dict | spaces.Tuple[Any]") -> list[tuple[Any, spaces.S
 
 
 def _bound(value: Any) -> float | None:
-    """Types without infinity mark the missing bound by their largest number."""
+    """The bound, or None: integer types mark a missing bound by their largest number."""
     number = float(np.float32(value))
     return number if abs(number) < float(np.finfo(np.float32).max) else None

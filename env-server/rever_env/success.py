@@ -1,4 +1,4 @@
-"""Success and the other episode statistics, after SIMPLER's evaluate()."""
+"""Success and other episode statistics, after SIMPLER's evaluate()."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ Vector = NDArray[np.float64]
 
 @dataclass
 class Memory:
-    """What the statistics remember of the episode so far."""
+    """The memory of the statistics within an episode."""
 
     source_origin: Vector  # settled xy of the source's origin, metres
     target_origin: Vector
@@ -30,7 +30,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class Touch:
-    """Contacts of the source now: force of each finger on it (N), and what else it touches."""
+    """Present contacts of the source: the force of each finger on it (N), and what it touches."""
 
     fingers: tuple[Vector, Vector]
     robot: bool
@@ -39,7 +39,7 @@ class Touch:
 
 
 def success_alone(is_success: bool, ever_success: bool) -> Statistics:
-    """Statistics of environments that report success and nothing else."""
+    """Statistics of environments that report only success."""
     return Statistics(
         is_success=is_success,
         is_grasped=False,
@@ -54,7 +54,7 @@ def success_alone(is_success: bool, ever_success: bool) -> Statistics:
 
 
 class Judge:
-    """Judges an episode by contacts and poses."""
+    """Computes the statistics from contacts and poses."""
 
     def __init__(self, model: mujoco.MjModel, task: Task) -> None:
         self._model = model
@@ -77,15 +77,15 @@ class Judge:
         )
 
     def judge(self, data: mujoco.MjData, memory: Memory) -> Statistics:
-        """Statistics of this step; advances the memory."""
+        """The statistics of this step; updates the memory."""
         rule = self._task.grasp
         touch = self.touch(data)
         grasped = self.grasped(data, touch)
         memory.grasped_steps = memory.grasped_steps + 1 if grasped else 0
         memory.ever_grasped |= grasped
         memory.consecutive_grasp |= memory.grasped_steps >= rule.consecutive_steps
-        # SIMPLER compares the settled origin with the current centre of mass here; the
-        # offset between the two leaks into the source's displacement and is kept.
+        # As in SIMPLER, this compares the settled origin with the present centre of mass, so that
+        # the offset between the two is part of the source's displacement.
         source_moved = norm(data.xipos[self._source][:2] - memory.source_origin)
         others = zip(
             (self._target, *self._distractors),
@@ -108,7 +108,7 @@ class Judge:
         )
 
     def touch(self, data: mujoco.MjData) -> Touch:
-        """Contacts of the source whose impulse per physics step is large enough to count."""
+        """The contacts of the source whose impulse per physics step is above the threshold."""
         fingers = (np.zeros(3), np.zeros(3))
         touched: set[str] = set()
         wrench = np.zeros(6)
@@ -126,7 +126,7 @@ class Judge:
                 kind = "target" if other == self._target else "elsewhere"
             is_finger = other in self._fingers
             if kind in touched and not is_finger:
-                continue  # an object on the table touches it in many points; one is enough
+                continue  # one contact per kind is enough; an object on the table has many
             mujoco.mj_contactForce(self._model, data, index, wrench)
             if norm(wrench[:3]) * self._task.settings.timestep < self._task.grasp.impulse_min:
                 continue
@@ -164,7 +164,7 @@ class Judge:
 
 
 def _half_extents(quaternion: Vector, extents: tuple[float, float, float]) -> Vector:
-    """SIMPLER rotates the full extents as a vector (signs and all) and halves them; kept as is."""
+    """As in SIMPLER: the full extents, rotated as a vector with its signs, and halved."""
     rotated = np.zeros(3)
     mujoco.mju_rotVecQuat(rotated, np.array(extents), quaternion)
     return 0.5 * rotated
@@ -179,7 +179,7 @@ def _descends(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
 
 
 def norm(vector: Vector) -> float:
-    """Euclidean norm summed in order, so that it is the same in every language."""
+    """The Euclidean norm, summed in order, so that it is equal in every language."""
     total = 0.0
     for value in vector.tolist():  # sum() compensates its rounding from Python 3.12 on
         total += value * value

@@ -17,14 +17,14 @@ from rever_env.protocol import Dimension
 Triple = tuple[float, float, float]
 Range = tuple[float, float]
 
-DEFAULT = "default"  # the variant of a task as its own table describes it
-ALL = "all"  # in place of a variant's or a task's name: every one of them
-BRIDGE = "bridge"  # the same, where other tasks can be named beside these
+DEFAULT = "default"  # the variant that the task's own table describes
+ALL = "all"  # in place of the name of a variant or task: all of them
+BRIDGE = "bridge"  # all Bridge tasks, where tasks of other simulators can be named as well
 _TABLE, _TEXT = "a table", "a text"
 
 
 class TaskId(NamedTuple):
-    """A task in one of its variants. Its text is TASK, or TASK/VARIANT for another than default."""
+    """A task in a variant. As text: TASK, or TASK/VARIANT unless it is the default variant."""
 
     task: str
     variant: str = DEFAULT
@@ -34,13 +34,13 @@ class TaskId(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "TaskId":
-        """TASK or TASK/VARIANT; a task's own name may hold slashes, as in ALE/Pong-v5/default."""
+        """Parses TASK or TASK/VARIANT. A task's name may have slashes: ALE/Pong-v5/default."""
         task, slash, variant = text.rpartition("/")
         return cls(task, variant) if slash else cls(text)
 
 
 class Pose(NamedTuple):
-    """Where a distractor starts: metres in the world frame, yaw in degrees."""
+    """The initial pose of a distractor: metres in the world frame, yaw in degrees."""
 
     x: float
     y: float
@@ -49,7 +49,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the objects start: metres in the world frame, yaw in degrees."""
+    """The initial poses of the objects: metres in the world frame, yaw in degrees."""
 
     source_x: float
     source_y: float
@@ -61,9 +61,9 @@ class Layout:
 
 @dataclass(frozen=True)
 class Distractor:
-    """An object that the task does not ask for: a body of the scene with a free joint of its name.
+    """An object irrelevant to the task: a body of the scene with a free joint of the same name.
 
-    x, y and yaw bound random layouts, in which it keeps separation_min from every other object.
+    x, y and yaw bound random layouts; separation_min is its distance to all other objects in them.
     """
 
     body: str
@@ -76,7 +76,7 @@ class Distractor:
 
 @dataclass(frozen=True)
 class MjcfChange:
-    """An attribute of one named element of the scene, set before the scene is compiled."""
+    """A changed attribute of a named element of the scene, set before the scene is compiled."""
 
     element: str  # geom, body, inertial ...
     name: str
@@ -86,7 +86,7 @@ class MjcfChange:
 
 @dataclass(frozen=True)
 class RandomRanges:
-    """The box random layouts are drawn from, and what is kept out of it."""
+    """The box that random layouts are drawn from, and the distances they keep."""
 
     source_x: Range
     source_y: Range
@@ -100,7 +100,7 @@ class RandomRanges:
 
 @dataclass(frozen=True)
 class WorldSettings:
-    """Physics and control settings shared by all tasks; units as in tasks.toml."""
+    """Physics and control settings of all tasks; units as in tasks.toml."""
 
     timestep: float
     substeps: int
@@ -142,11 +142,11 @@ class GraspRule:
 
 @dataclass(frozen=True)
 class Task:
-    """One task in one variant, complete: nothing else decides what an episode is."""
+    """A task in a variant: the complete description of its episodes."""
 
     name: str
     variant: str
-    index: int  # the task's place in the file, the same for its variants; part of the noise's seed
+    index: int  # index of the task in the file, the same for its variants; part of the noise seed
     version: int
     gymnasium_id: str
     instruction: str
@@ -191,9 +191,9 @@ class Task:
 
 
 def load(assets: Path | None = None) -> dict[str, Task]:
-    """All tasks in all variants by the text of their id, in the file's order.
+    """All tasks in all variants by the text of their id, in the order of the file.
 
-    Each task is followed by its variants. ValueError names an unknown or missing key.
+    Each task is followed by its variants. ValueError for an unknown or missing key.
     """
     folder = assets if assets is not None else _assets_folder()
     path = folder / "tasks.toml"
@@ -206,7 +206,7 @@ def load(assets: Path | None = None) -> dict[str, Task]:
 
 
 def find(tasks: Mapping[str, Task], name: str, variant: str = DEFAULT) -> Task:
-    """One task in one variant; InvalidReset says which there are."""
+    """The task in this variant; InvalidReset names the known ones."""
     task = tasks.get(str(TaskId(name, variant)))
     if task is not None:
         return task
@@ -219,9 +219,10 @@ def find(tasks: Mapping[str, Task], name: str, variant: str = DEFAULT) -> Task:
 
 
 def choose(tasks: Mapping[str, Task], names: Iterable[str] | None) -> list[Task]:
-    """The named tasks in the file's order; every task in its default variant without names.
+    """The named tasks in the order of the file; without names, all tasks in their default variant.
 
-    A name is TASK, TASK/VARIANT, TASK/all, or all: every variant of the task, or of every task.
+    names: TASK, TASK/VARIANT, TASK/all (all variants of the task), or all (all variants of all
+    tasks). InvalidReset for an unknown name.
     """
     if names is None:
         return [task for task in tasks.values() if task.variant == DEFAULT]
@@ -240,7 +241,7 @@ def choose(tasks: Mapping[str, Task], names: Iterable[str] | None) -> list[Task]
 
 
 def _assets_folder() -> Path:
-    """Inside an installed wheel the assets lie in the package, in the repository beside it."""
+    """The folder assets: inside an installed package, beside the package in the repository."""
     package = Path(__file__).resolve().parent
     inside = package / "assets"
     return inside if inside.is_dir() else package.parent / "assets"
@@ -272,7 +273,7 @@ def _tasks(description: dict[str, Any], folder: Path) -> Iterable[Task]:
 
 
 def _merged(where: str, task: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """The task's table with a variant's fields in place of its own, key by key in tables."""
+    """The task's table with the variant's fields replaced, key by key inside tables."""
     merged = dict(task)
     for key, value in changes.items():
         own = task.get(key)
@@ -283,7 +284,7 @@ def _merged(where: str, task: dict[str, Any], changes: dict[str, Any]) -> dict[s
 
 
 def _task(where: str, table: dict[str, Any], given: dict[str, Any], folder: Path) -> Task:
-    """given: what is not in the task's own table."""
+    """given: the fields that are not in the task's own table."""
     own = {field.name for field in fields(Task)} - {*given, "layouts"} | {"grid"}
     _check_keys(where, table, own, optional={"target_height", "distractors", "mjcf"})
     _check_keys(f"{where}.grid", table["grid"], {"layouts"})
@@ -312,7 +313,7 @@ def _task(where: str, table: dict[str, Any], given: dict[str, Any], folder: Path
 
 
 def _changes(where: str, table: dict[str, Any]) -> Iterable[MjcfChange]:
-    """Of a table element -> name -> attribute -> value."""
+    """Changes from a table element -> name -> attribute -> value."""
     for element, names in table.items():
         for name, attributes in _expect(f"{where}.{element}", names, _TABLE).items():
             place = f"{where}.{element}.{name}"
@@ -322,7 +323,7 @@ def _changes(where: str, table: dict[str, Any]) -> Iterable[MjcfChange]:
 
 
 def _made(kind: type[Any], where: str, table: dict[str, Any]) -> Any:
-    """The dataclass with the table's values; ValueError for a key too many or too few."""
+    """A dataclass from a table; ValueError for an unknown or missing key."""
     _check_keys(where, table, {field.name for field in fields(kind)})
     return kind(**_tuples(table))
 
@@ -343,7 +344,7 @@ def _check_keys(
 
 
 def _rows(where: str, rows: Any, length: int, count: int | None = None) -> list[Any]:
-    """The rows, each of so many numbers, and so many of them where it is given."""
+    """The rows, each with `length` numbers; `count` rows, if it is given."""
     if count is not None and len(rows) != count:
         raise ValueError(f"{where}: expected {count} rows, one per layout, got {len(rows)}")
     for row in rows:
@@ -359,10 +360,10 @@ def _expect(where: str, value: Any, kind: str) -> Any:
 
 
 def _kind(value: Any) -> str:
-    """What a value of TOML is, in words."""
+    """The name of a TOML value's type."""
     if isinstance(value, list) and all(type(each) in (int, float) for each in value):
         return f"{len(value)} numbers"
-    kinds = {bool: "a truth value", int: "a number", float: "a number", str: _TEXT, dict: _TABLE}
+    kinds = {bool: "a boolean", int: "a number", float: "a number", str: _TEXT, dict: _TABLE}
     return kinds.get(type(value), f"a {type(value).__name__}")
 
 

@@ -1,4 +1,4 @@
-"""The trace subcommand: every number of episodes, to compare two simulators."""
+"""The trace subcommand: all numbers of episodes, for the comparison of two simulators."""
 
 import hashlib
 import json
@@ -17,11 +17,11 @@ from rever_env.world import Observation, Statistics, World
 def lines(
     task: Task, starts: list[tuple[int | None, int]], actions: Path | None, side: int
 ) -> Iterator[str]:
-    """One JSON object for each reset and each step, to the horizon or the actions' end.
+    """One JSON object for each reset and each step, up to the horizon or the end of the actions.
 
-    starts: layout and seed of each episode; all of them run in the same environment. actions: a
-    file of one action per line, 7 numbers; without it the scripted expert acts. Floats stand as
-    their bits, 16 (or 8) hexadecimal digits.
+    starts: layout and seed of each episode; all episodes run in the same environment. actions: a
+    file with 7 numbers per line; None for the scripted expert. Floats are written as their bits,
+    16 (or 8) hexadecimal digits.
     """
     with World(task, side, side) as world:
         for layout, seed in starts:
@@ -36,7 +36,7 @@ def lines(
 
 
 def read(file: Path) -> Iterator[NDArray[np.float64]]:
-    """The actions of a file, float64 (7,), rounded to 32 bits as on the wire."""
+    """The actions in a file, float64 (7,), rounded to 32 bits as in the protocol."""
     for line in file.read_text(encoding="utf-8").splitlines():
         yield np.array([float(word) for word in line.split()], np.float32).astype(np.float64)
 

@@ -1,4 +1,4 @@
-"""The simulated environment of one task: reset, step, save, restore, render."""
+"""World: one Bridge task in MuJoCo, with reset, step, save, restore and rendering."""
 
 from dataclasses import dataclass
 from types import TracebackType
@@ -35,9 +35,9 @@ __all__ = [
     "World",
 ]
 
-_START_GAP = 0.002  # objects start this far above rest, metres
-# m/s or rad/s: beyond this the physics has diverged. An object that falls off the table and lands
-# on an edge spins at more than 100 rad/s.
+_START_GAP = 0.002  # initial height of objects above their rest, metres
+# m/s or rad/s: a larger speed means that the physics has diverged. An object that falls off the
+# table and lands on an edge spins at more than 100 rad/s.
 _SPEED_MAX = 1000.0
 _DIVERGENCE = {
     int(warning): warning.name
@@ -47,18 +47,18 @@ _DIVERGENCE = {
         mujoco.mjtWarning.mjWARN_BADQACC,
     )
 }
-# MuJoCo's values for a kinematic tree that has just moved, and for one that may sleep.
+# MuJoCo's values for a kinematic tree that has just moved, and for one that is ready to sleep.
 _AWAKE, _READY_TO_SLEEP = -(1 + mujoco.mjMINAWAKE), -1
-# Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
+# In Bridge the gripper's attitude is relative to pointing down: R_tcp times this, transposed.
 DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What a policy may see. image: uint8 (height, width, 3).
+    """The input of a policy.
 
-    state: float32 (8,) in Bridge's order: x y z (m) roll pitch yaw (rad, base frame), pad 0,
-    gripper opening 0 to 1.
+    image: uint8 (height, width, 3), RGB. state: float32 (8,) in Bridge's order: x y z (m) roll
+    pitch yaw (rad) in the base frame, 0, gripper opening 0 to 1.
     """
 
     image: NDArray[np.uint8]
@@ -68,7 +68,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class Transition:
-    """The result of one control step. Success ends no episode: SIMPLER reads the last step."""
+    """The result of one control step. Success does not terminate: SIMPLER judges the last step."""
 
     observation: Observation
     statistics: Statistics
@@ -118,7 +118,7 @@ class World:
         return self._observe()
 
     def step(self, action: NDArray[np.float64]) -> Transition:
-        """One control step of 0.2 s. action: float64 (7,), see the controller; gripper +1 open."""
+        """Executes one control step of 0.2 s. action: float64 (7,), units as in BridgeEnv."""
         memory = self._running()
         if self.steps >= self.task.steps_max:
             raise InvalidAction(
@@ -139,7 +139,7 @@ class World:
         )
 
     def save(self) -> bytes:
-        """The whole state of the episode, bit-exact."""
+        """The complete state of the episode, bit-exact."""
         return snapshot.pack(self.task, self.model, self.data, self.controller, self._memory_now())
 
     def restore(self, content: bytes) -> Observation:
@@ -151,11 +151,11 @@ class World:
         return self._observe()
 
     def expert_action(self) -> NDArray[np.float64]:
-        """The scripted expert's noise-free action here, float64 (7,); changes nothing."""
+        """The scripted expert's action in this state, float64 (7,); changes nothing."""
         return self.expert_decision().action
 
     def expert_decision(self) -> expert.Decision:
-        """The expert's action with the reason for it."""
+        """The scripted expert's action with its subtask; changes nothing."""
         return expert.decide(self.task, expert.look(self))
 
     def close(self) -> None:
@@ -173,7 +173,7 @@ class World:
         self.close()
 
     def running_memory(self) -> Memory:
-        """The statistics' memory; an error before the first reset."""
+        """The memory of the statistics; an error before the first reset."""
         return self._running()
 
     def gripper_opening(self) -> float:
@@ -191,7 +191,7 @@ class World:
         return self.memory
 
     def _settle(self) -> None:
-        """Lets the objects come to rest, as SIMPLER does; its drop before that is left out."""
+        """Lets the objects come to rest as SIMPLER does, but without its drop before that."""
         settings = self.task.settings
         steps = round(settings.settle / settings.timestep)
         mujoco.mj_step(self.model, self.data, steps)
@@ -222,18 +222,17 @@ class World:
         self._refresh()
 
     def _forward(self) -> None:
-        """Poses and contacts of this moment: mj_step leaves them one physics step old.
+        """Updates poses and contacts: after mj_step they are one physics step old.
 
-        Sleeping objects are woken, because MuJoCo leaves their contacts out and the judge needs
-        them; they sleep again after the next physics step. Which ones follows from the velocities
-        alone, and the warm start is kept, so that continuing from here equals continuing after a
-        restore.
+        Wakes sleeping objects, because MuJoCo leaves out their contacts and the success rules need
+        them; they sleep again after the next physics step. Which ones depends only on velocities,
+        and the warm start is kept, so that continuing here equals continuing after a restore.
         """
         data = self.data
         warm_start = data.qacc_warmstart.copy()
         asleep = np.maximum.reduceat(np.abs(data.qvel), self.model.tree_dofadr) == 0.0  # (trees,)
         resting = asleep[self.model.dof_treeid]
-        data.qvel[resting] = -0.0  # wakes them in MuJoCo and changes nothing else
+        data.qvel[resting] = -0.0  # only wakes them
         mujoco.mj_forward(self.model, data)
         data.qvel[resting] = 0.0
         data.tree_asleep[:] = np.where(asleep, _READY_TO_SLEEP, _AWAKE)
@@ -264,7 +263,7 @@ class World:
 
 
 def broken(model: mujoco.MjModel, data: mujoco.MjData) -> str:
-    """Why the physics counts as diverged; empty if it does not."""
+    """Why the physics has diverged; empty if it has not."""
     speeds = np.abs(data.qvel)
     fastest = int(speeds.argmax())
     speed = float(speeds[fastest])
@@ -278,16 +277,16 @@ def broken(model: mujoco.MjModel, data: mujoco.MjData) -> str:
 
 
 def divergence(data: mujoco.MjData) -> list[str]:
-    """Warnings since the last reset that the physics diverged.
+    """MuJoCo's warnings of divergence since the last reset.
 
-    Where MuJoCo finds that, it starts anew from the model's defaults, and all is finite again.
+    MuJoCo then resets itself to the model's defaults, so that all numbers are finite again.
     """
     counts = data.warning.number
     return [name for index, name in _DIVERGENCE.items() if counts[index] > 0]
 
 
 def place_objects(model: mujoco.MjModel, data: mujoco.MjData, task: Task, layout: Layout) -> None:
-    """Puts source, target and distractors above where they will rest."""
+    """Places source, target and distractors above their resting positions."""
     source = Pose(layout.source_x, layout.source_y, layout.source_yaw)
     rows = [(task.source, source, task.source_height)]
     if task.target_height is not None:
@@ -304,9 +303,9 @@ def place_objects(model: mujoco.MjModel, data: mujoco.MjData, task: Task, layout
 
 
 def silence_warnings() -> None:
-    """Their counters are read after each step.
+    """Ignores MuJoCo's warnings; World reads their counters after each step.
 
-    MuJoCo's own handler would also append to a log file in whatever folder the process runs in.
+    MuJoCo's own handler would append to a log file in the current folder.
     """
     mujoco.set_mju_user_warning(lambda _: None)
 

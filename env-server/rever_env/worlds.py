@@ -1,4 +1,4 @@
-"""A pool of the worlds of one process: created on demand, reused by sessions, limited."""
+"""Worlds: a limited pool of the worlds of a server, created on demand and reused."""
 
 import logging
 from collections import deque
@@ -42,18 +42,18 @@ class OfferedTask(Protocol):
 
 
 class AnyWorld(Protocol):
-    """The interface between a session and any simulator. Errors: see rever_env.fault."""
+    """The interface of a simulator for sessions. Errors: see rever_env.fault."""
 
     def reset(self, *, layout: int | None, seed: int) -> Observation:
-        """The same arguments give the same bytes."""
+        """Begins an episode; the same arguments give the same bytes."""
         ...
 
     def step(self, action: NDArray[np.float64]) -> Transition:
-        """One control step."""
+        """Executes one control step."""
         ...
 
     def save(self) -> Any:
-        """The whole state, for restore of the same world."""
+        """The complete state, for restore() of a world with the same key."""
         ...
 
     def restore(self, content: Any) -> Observation:
@@ -61,7 +61,7 @@ class AnyWorld(Protocol):
         ...
 
     def expert_action(self) -> NDArray[np.float64]:
-        """The action of a scripted expert, if there is one."""
+        """The action of the scripted expert, if the task has one."""
         ...
 
     def close(self) -> None:
@@ -70,15 +70,15 @@ class AnyWorld(Protocol):
 
 
 class UnknownTask(ValueError):
-    """The task or its variant is not offered here."""
+    """The server does not offer the task or its variant."""
 
 
 class Worlds:
-    """Not thread-safe.
+    """The pool. Not thread-safe.
 
-    Worlds keep nothing from one episode to the next, so sessions may share them in turn. idle_max:
-    unused worlds that are kept, since creating one takes tens of milliseconds. image_side_max: 0
-    when the worlds have no images.
+    Worlds have no memory between episodes, so that sessions can use them in turn. idle_max: number
+    of unused worlds to keep, because creating one takes tens of milliseconds. image_side_max: 0 if
+    the worlds have no images.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Worlds:
         self._idle: deque[tuple[Key, AnyWorld]] = deque()
 
     def task(self, name: str, variant: str) -> OfferedTask:
-        """The task; UnknownTask when it is not offered."""
+        """The task; UnknownTask if it is not offered."""
         task = self.tasks.get((name, variant))
         if task is None:
             offered = ", ".join(str(TaskId(*known)) for known in self.tasks)
@@ -120,11 +120,11 @@ class Worlds:
             self.discard(self._idle.popleft()[1])
 
     def discard(self, world: AnyWorld) -> None:
-        """Closes a world for good. Another project's environment may fail even then."""
+        """Closes a world. Environments of other projects may raise even then."""
         try:
             world.close()
         except Exception:
-            _log.exception("a world could not be closed")
+            _log.exception("cannot close a world")
 
     def close(self) -> None:
         """Closes the idle worlds."""

@@ -32,12 +32,12 @@ def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
         (
             "serve --listen tcp/127.0.0.1:9 --id-file /nowhere/id",
             2,
-            "error: --id-file /nowhere/id: expected it in a folder that exists",
+            "error: --id-file /nowhere/id: expected an existing folder, got /nowhere",
         ),
         (
             "serve --listen tcp/127.0.0.1:9 --control-hz 5",
             2,
-            "error: --control-hz has no effect without tasks of robosuite's own",
+            "error: --control-hz has no effect without --robosuite and one of robosuite's own",
         ),
     ],
 )
@@ -51,8 +51,8 @@ def test_an_error_is_one_line(arguments: str, status: int, words: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("demonstrate --episodes 0 --out x", "--episodes: expected a whole number from 1, got 0"),
-        ("expert --processes -1", "--processes: expected a whole number from 1, got -1"),
+        ("demonstrate --episodes 0 --out x", "--episodes: expected a positive whole number, got 0"),
+        ("expert --processes -1", "--processes: expected a positive whole number, got -1"),
         ("serve --arguments notjson", "--arguments: expected a JSON object, got notjson"),
         ("serve --listen 127.0.0.1", "endpoint '127.0.0.1': expected tcp/HOST:PORT or HOST:PORT"),
         ("serve --listen tcp/127.0.0.1:99999", "expected tcp/HOST:PORT or HOST:PORT"),

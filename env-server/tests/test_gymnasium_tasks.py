@@ -153,7 +153,7 @@ def test_an_environment_without_an_instruction_has_its_id() -> None:
 
 def test_a_camera_that_is_not_served_is_named(caplog: pytest.LogCaptureFixture) -> None:
     task = cup()
-    assert "image front of its observation is served, and not images.wrist" in caplog.text
+    assert "serving the image front of its observation, not images.wrist" in caplog.text
     assert "text language of its observation is the instruction, and not task" in caplog.text
     assert GymnasiumWorld(task, 4, 6).reset(layout=None, seed=0).image.max() == 1
     names = [dimension.name.split("[")[0] for dimension in task.state]
@@ -231,12 +231,15 @@ def parsed(line: str) -> argparse.Namespace:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("--control-hz 5", "--control-hz has no effect without tasks of robosuite's own"),
-        ("--horizon 9", "--horizon has no effect without --gymnasium or tasks of robosuite's own"),
+        (
+            "--control-hz 5",
+            "--control-hz has no effect without --robosuite and one of robosuite's own",
+        ),
+        ("--horizon 9", "--horizon has no effect without --gymnasium, or --robosuite and"),
         ("--robosuite widowx_stack_cube --horizon 9", "--horizon has no effect without"),
         ("--robosuite widowx_stack_cube --robots UR5e", "--robots has no effect without"),
         ("--gymnasium CartPole-v1 --control-hz 5", "--control-hz has no effect without"),
-        ("--gymnasium CartPole-v1 --horizon 9", "every environment has a limit of its own"),
+        ("--gymnasium CartPole-v1 --horizon 9", "every environment has its own step limit"),
         ("--robosuite Lift --import somewhere", "--import has no effect without --gymnasium"),
         ("--image-key front", "--image-key has no effect without --gymnasium"),
         ("--state-keys a b", "--state-keys has no effect without --gymnasium"),
@@ -253,8 +256,8 @@ def test_an_option_without_effect_is_refused(line: str, words: str) -> None:
     [
         ("--arguments notjson", "expected a JSON object, got notjson: Expecting value"),
         ("--arguments [1]", "expected a JSON object, got [1]"),
-        ("--gymnasium a --horizon 0", "expected a whole number from 1, got 0"),
-        ("--gymnasium a --horizon ten", "expected a whole number from 1, got ten"),
+        ("--gymnasium a --horizon 0", "expected a positive whole number, got 0"),
+        ("--gymnasium a --horizon ten", "expected a positive whole number, got ten"),
     ],
 )
 def test_a_value_that_cannot_be_read_is_refused(

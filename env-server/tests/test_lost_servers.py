@@ -30,7 +30,7 @@ def test_a_killed_server_is_named_and_found_again_by_reset() -> None:
     with pytest.raises(RemoteFault, match=f"server {server} at {endpoint} is gone"):
         remote.step(STILL)
     assert time.monotonic() - begun < 10.0
-    with pytest.raises(RemoteFault, match="the session is lost, and reset opens a new one"):
+    with pytest.raises(RemoteFault, match="the session is lost; reset opens a new one"):
         remote.step(STILL)
     with pytest.raises(RemoteFault, match="connection refused; is `python -m rever_env serve"):
         remote.reset(seed=0)

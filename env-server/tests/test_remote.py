@@ -237,7 +237,7 @@ def test_a_session_that_the_server_ended_says_why_and_reset_opens_another(endpoi
     with pytest.raises(RemoteFault, match="ended: its holder has been gone for 10 s"):
         while time.monotonic() < ends_at:
             remote.session.ask(lambda sequence: protocol.Save(sequence, 0))
-    with pytest.raises(RemoteFault, match="the session is lost, and reset opens a new one"):
+    with pytest.raises(RemoteFault, match="the session is lost; reset opens a new one"):
         remote.step(STILL)
     remote.reset(seed=1)
     remote.step(STILL)

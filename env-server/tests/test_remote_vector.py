@@ -55,7 +55,7 @@ def test_a_wrong_action_moves_no_environment_of_a_vector(endpoint: str) -> None:
     actions[1, 0] = np.nan
     with pytest.raises(ValueError, match="environment 1: action: expected finite numbers"):
         environments.step(actions)
-    with pytest.raises(ValueError, match="actions: expected 2 of them, got 3"):
+    with pytest.raises(ValueError, match="actions: expected 2, got 3"):
         environments.step(np.tile(STILL, (3, 1)))
     observation, *_ = run(environments, 1)
     alone = rever_env.RemoteEnv(endpoint, **SMALL)

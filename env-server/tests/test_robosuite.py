@@ -84,7 +84,7 @@ def test_a_change_of_the_robot_is_refused_in_robosuite() -> None:
     camera = tasks.MjcfChange("camera", "third_person", "focal", "0.5 0.5")
     bridge_arena(replace(task, mjcf=(camera,)))
     finger = tasks.MjcfChange("geom", "left_finger_pad", "friction", "2 0.01 0.0001")
-    with pytest.raises(InvalidReset, match="changes geom left_finger_pad"):
+    with pytest.raises(InvalidReset, match="changes its geom left_finger_pad"):
         bridge_arena(replace(task, mjcf=(camera, finger)))
 
 

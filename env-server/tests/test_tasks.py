@@ -83,7 +83,7 @@ def test_tasks_are_chosen_by_id_and_by_group() -> None:
         (HALF, f"{HALF}\nrandom.speed = 1", "size-0.5.random: unknown key 'speed'"),
         (HALF, f"{HALF}\nindex = 1", "size-0.5: unknown key 'index'"),
         (HALF, f"{HALF}\nvariants.x.hover = 1", "size-0.5: unknown key 'variants'"),
-        (HALF, f"{HALF}\nhover = true", "hover: expected a number, got a truth value"),
+        (HALF, f"{HALF}\nhover = true", "hover: expected a number, got a boolean"),
         (HALF, f"{HALF}\ntarget_extents = [1, 2]", "expected 3 numbers, got 2 numbers"),
         (WORDED, f"{WORDED}\nmjcf.geom.a.size = 1", "geom.a.size: expected a text, got a number"),
         (WORDED, f"{WORDED}\nmjcf.geom.a = 1", "geom.a: expected a table, got a number"),

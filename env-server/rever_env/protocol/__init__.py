@@ -1,8 +1,12 @@
-"""What an agent and an environment server may say to each other: messages, codecs, keys.
+"""The protocol between agents and environment servers: messages, codecs, zenoh keys, limits.
 
-An agent reads a server's Description, leases a session with Open, and then sends one Request at a
-time and waits for its Reply. The bytes of one example of each message lie in protocol/golden of
-the repository; the Rust crate `protocol` is the specification.
+An agent reads a server's Description, opens a session with Open, and then sends one Request at a
+time and waits for its Reply. The Rust crate `protocol` is the specification; protocol/golden in the
+repository has the bytes of one example of each message. Units, shapes and control rate of a task
+are in its TaskDescription.
+
+Codecs (DESCRIPTION, OPEN, OPENING, REQUEST, REPLY, ...) have encode and decode. Both raise
+CodecError: TooLarge, Malformed, or Invalid for a value out of bounds.
 """
 
 from rever_env.protocol import limits

@@ -1,8 +1,8 @@
-"""Messages to bytes and back, strictly: a body is read only when every byte of it is meant.
+"""Strict encoding and decoding of messages: unknown fields and trailing bytes are errors.
 
-A message is a frozen dataclass with a method validate; its annotations say how fields lie on the
-wire. int: unsigned, 64 bits unless annotated; float: 32 bits. The order of a map's entries is free
-when reading and the dataclass's when writing.
+A message is a frozen dataclass with a method validate; its annotations define the wire types. int:
+unsigned, 64 bits unless annotated; float: 32 bits. Entries of a map are written in the order of the
+dataclass and read in any order.
 """
 
 import array
@@ -23,19 +23,19 @@ Writer = Callable[[Any], object]
 
 
 class CodecError(ValueError):
-    """A message was not written or not read."""
+    """A message cannot be encoded or decoded."""
 
 
 class TooLarge(CodecError):
-    """Beyond the message's size limit; nothing was decoded."""
+    """The message exceeds its size limit; nothing was decoded."""
 
 
 class Malformed(CodecError):
-    """The bytes are not this message."""
+    """The bytes are not a message of this kind."""
 
 
 class Invalid(CodecError):
-    """The bytes are this message, but a value in it is out of bounds. message: what was read."""
+    """A value of the message is out of bounds. message: the decoded message, if there is one."""
 
     def __init__(self, reason: str, message: Any = None) -> None:
         super().__init__(reason)
@@ -44,7 +44,7 @@ class Invalid(CodecError):
 
 @dataclasses.dataclass(frozen=True)
 class Bits:
-    """Annotation of an int: how wide it may be."""
+    """Annotation of an int: its width on the wire."""
 
     count: int
 
@@ -53,14 +53,14 @@ class Message(Protocol):
     """Any message."""
 
     def validate(self) -> None:
-        """Raises ValueError that names the field, what was expected and what came."""
+        """Raises a ValueError that names the field, the expected and the actual value."""
 
 
 M = TypeVar("M", bound=Message)
 
 
 class Codec(Generic[M]):
-    """Writes and reads one kind of message, or one of several variants under their names."""
+    """Encodes and decodes one kind of message, or one of several variants by their names."""
 
     def __init__(
         self,
@@ -80,14 +80,14 @@ class Codec(Generic[M]):
             self._reader, self._writer = _variants(content)
 
     def encode(self, message: M) -> bytes:
-        """Bytes of message; an invalid one is refused here, so that a peer never sees it."""
+        """The bytes of a message; Invalid for an invalid one, TooLarge beyond the size limit."""
         self._validate(message)
         data: bytes = msgpack.packb(self._writer(message), use_single_float=True)
         self.check_size(len(data))
         return data
 
     def decode(self, data: bytes) -> M:
-        """The message in exactly these bytes."""
+        """The message in exactly these bytes; CodecError for any other bytes."""
         self.check_size(len(data))
         try:
             value = msgpack.unpackb(
@@ -118,7 +118,7 @@ class Codec(Generic[M]):
         return message
 
     def check_size(self, count: int) -> None:
-        """Refuses a message by its size alone, for those who hold bytes not yet copied."""
+        """TooLarge if a message of so many bytes exceeds the limit."""
         if count > self.bytes_max:
             raise TooLarge(f"{self.name} has {count} bytes, limit {self.bytes_max}")
 
@@ -177,7 +177,7 @@ def _dataclass(kind: type[Any]) -> tuple[Reader, Writer]:
         return kind(*[reader(value[name]) for name, reader, _ in fields])
 
     def write(message: Any) -> object:
-        values = vars(message)  # in the order of the fields, for __init__ has set them
+        values = vars(message)  # in the order of the fields, because __init__ has set them
         if not rewritten:
             return values
         return values | {name: writer(values[name]) for name, writer in rewritten}
@@ -186,7 +186,7 @@ def _dataclass(kind: type[Any]) -> tuple[Reader, Writer]:
 
 
 def _as_it_is(value: object) -> object:
-    """What msgpack writes as the protocol wants it."""
+    """The value as msgpack encodes it for the protocol."""
     return value
 
 
@@ -240,7 +240,7 @@ def _floats(value: object) -> tuple[float, ...]:
     for element in value:
         if type(element) is not float:
             raise ValueError(f"invalid type: {_kind(element)}, expected f32")
-    # MessagePack's reader tells no double from a float: a number that 32 bits do not hold was one.
+    # The reader does not tell doubles from floats: a number that needs more than 32 bits was one.
     for number, single in zip(value, array.array("f", value), strict=True):
         if number != single and not math.isnan(number):
             raise ValueError(f"expected 32-bit floats, got {number}")

@@ -1,4 +1,4 @@
-"""What a server says about itself."""
+"""A server's description: its simulator, tasks and limits."""
 
 from dataclasses import dataclass
 
@@ -8,9 +8,9 @@ from rever_env.protocol.value import U32
 
 @dataclass(frozen=True)
 class Dimension:
-    """One number of a state or of an action, with its bounds where it has some.
+    """One number of a state or an action: name, unit and optional bounds.
 
-    discrete: only the whole numbers from low to high count.
+    discrete: only whole numbers from low to high are valid.
     """
 
     name: str
@@ -25,16 +25,17 @@ class Dimension:
         value.finite(field, bounds)
         is_whole = len(bounds) == 2 and all(bound.is_integer() for bound in bounds)
         if self.discrete and not is_whole:
-            raise ValueError(f"{field}: expected whole bounds, for it is discrete")
+            raise ValueError(f"{field}: expected whole bounds, because it is discrete")
         if len(bounds) == 2 and bounds[0] > bounds[1]:
             raise ValueError(f"{field}: expected low <= high, got {bounds[0]:g} and {bounds[1]:g}")
 
 
 @dataclass(frozen=True)
 class TaskDescription:
-    """One task in one variant. layouts: how many fixed ones there are.
+    """One task in one variant.
 
-    control_hz: control steps per second of simulated time, where it is known.
+    steps_max: episodes are truncated after so many steps. control_hz: control steps per second of
+    simulated time, if it is known. layouts: the number of fixed initial layouts.
     """
 
     task: str
@@ -50,7 +51,7 @@ class TaskDescription:
 
 @dataclass(frozen=True)
 class Description:
-    """The answer to a query on describe."""
+    """The answer to a query on the key describe."""
 
     protocol: U32
     server: str

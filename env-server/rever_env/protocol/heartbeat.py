@@ -1,4 +1,4 @@
-"""The sign that a server's simulation moves, which its liveliness token cannot give."""
+"""Heartbeat: a server's simulation makes progress. Its liveliness token cannot show that."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from rever_env.protocol.value import U32
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """Sent by the thread that steps the worlds, about twice a second."""
+    """Sent by the simulation thread about twice a second."""
 
     server: str
     sessions: U32

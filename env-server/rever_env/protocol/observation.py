@@ -1,4 +1,4 @@
-"""What a policy sees before a decision."""
+"""Observation: what a policy sees before a decision."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from rever_env.protocol import limits, value
 
 @dataclass(frozen=True)
 class Image:
-    """A picture: height x width x 3 bytes, rows from the top, red green blue."""
+    """An RGB image: height x width x 3 bytes, rows from the top."""
 
     height: int
     width: int
@@ -29,9 +29,10 @@ class Image:
 
 @dataclass(frozen=True)
 class Observation:
-    """Everything that a policy may know, and on request the expert's opinion.
+    """The input of a policy.
 
-    state, expert_action: as the task's description says.
+    state: the numbers that TaskDescription.state describes, with their units. expert_action: the
+    action of the scripted expert, as TaskDescription.action describes; None unless Open.expert.
     """
 
     image: Image

@@ -1,4 +1,4 @@
-"""Leasing a session."""
+"""Open and its answers: leasing a session."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,11 @@ from rever_env.protocol.value import U32
 
 @dataclass(frozen=True)
 class Open:
-    """The payload of a query on open. expert: observations carry the expert's action."""
+    """The payload of a query on the key open.
+
+    image_height, image_width: pixels; 0 and 0 for no image. expert: observations have the action of
+    the scripted expert. holder: a name for messages and logs.
+    """
 
     protocol: U32
     task: str
@@ -29,7 +33,7 @@ class Open:
 
 @dataclass(frozen=True)
 class Opened:
-    """The session is the asker's for as long as its liveliness token stands."""
+    """The session belongs to the asker while the asker's liveliness token exists."""
 
     session: str
 
@@ -39,7 +43,7 @@ class Opened:
 
 @dataclass(frozen=True)
 class OpenRefused:
-    """There is no session for the asker; on the wire its name is Refused."""
+    """The server refuses a session. On the wire the variant is called Refused."""
 
     reason: str
 

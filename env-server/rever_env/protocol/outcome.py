@@ -1,4 +1,4 @@
-"""What became of one episode, for observers."""
+"""EpisodeOutcome: the result of an episode, for observers."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from rever_env.protocol.value import U32
 
 @dataclass(frozen=True)
 class EpisodeOutcome:
-    """Published once for each episode that ran to its end; an episode that broke has none."""
+    """Published once for each completed episode; an episode with a fault has no outcome."""
 
     run: str
     task: str

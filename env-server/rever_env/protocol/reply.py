@@ -1,4 +1,4 @@
-"""What a server answers, echoing the request's number."""
+"""Replies of a server; each repeats the sequence number of its request."""
 
 import enum
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class Transition:
 
 
 class FaultKind(str, enum.Enum):
-    """What broke in the world."""
+    """The kind of a fault."""
 
     PHYSICS_DIVERGED = "PhysicsDiverged"
     RENDERER_UNAVAILABLE = "RendererUnavailable"
@@ -30,7 +30,7 @@ class FaultKind(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Observed(Numbered):
-    """To Reset."""
+    """Reply to Reset."""
 
     sequence: int
     observation: Observation
@@ -42,9 +42,11 @@ class Observed(Numbered):
 
 @dataclass(frozen=True)
 class Stepped(Numbered):
-    """To Step. simulator_us: microseconds of physics, picture and judge, without the wire.
+    """Reply to Step.
 
-    changed_tiles: None, or the image's pixels are those of these tiles only (tiles.complete).
+    simulator_us: microseconds of physics, rendering and success rules, without the network.
+    changed_tiles: None for a whole image; otherwise the pixels are those of these tiles only, which
+    tiles.complete adds to the last image.
     """
 
     sequence: int
@@ -65,14 +67,14 @@ class Stepped(Numbered):
 
 @dataclass(frozen=True)
 class Saved(Numbered):
-    """To Save."""
+    """Reply to Save."""
 
     sequence: int
 
 
 @dataclass(frozen=True)
 class Restored(Numbered):
-    """To Restore."""
+    """Reply to Restore."""
 
     sequence: int
     observation: Observation
@@ -84,14 +86,17 @@ class Restored(Numbered):
 
 @dataclass(frozen=True)
 class Closed(Numbered):
-    """To Close."""
+    """Reply to Close."""
 
     sequence: int
 
 
 @dataclass(frozen=True)
 class Refused:
-    """The request was wrong; the world is unchanged. 0: its number is unknown or is no more."""
+    """The request was invalid; the environment is unchanged.
+
+    sequence 0: the request could not be read, or the session has ended.
+    """
 
     sequence: int
     reason: str
@@ -103,7 +108,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Faulted(Numbered):
-    """The world broke: the episode is void, and only Reset or Close can follow."""
+    """The environment broke: the episode has no outcome; only Reset or Close may follow."""
 
     sequence: int
     kind: FaultKind

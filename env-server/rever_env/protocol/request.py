@@ -1,7 +1,6 @@
-"""What the holder of a session asks, one at a time.
+"""Requests of the holder of a session, one at a time, numbered from 1.
 
-The same number again is answered with the same bytes again, a lower one with silence, a gap is
-refused.
+A repeated number gets the same reply again, a lower one gets no reply, a gap is refused.
 """
 
 from dataclasses import dataclass
@@ -12,7 +11,10 @@ from rever_env.protocol.value import U32, Numbered
 
 @dataclass(frozen=True)
 class Reset(Numbered):
-    """Starts an episode; ends the one before. layout None draws from the seed."""
+    """Starts an episode and ends the previous one.
+
+    layout: a fixed initial layout; None draws a random one from the seed, 0 to 2^53 - 1.
+    """
 
     sequence: int
     task: str
@@ -29,7 +31,10 @@ class Reset(Numbered):
 
 @dataclass(frozen=True)
 class Step(Numbered):
-    """One control step. In a Bridge task: metres, rotation vector (rad), gripper +1 open."""
+    """One control step. action: the numbers that TaskDescription.action describes.
+
+    Bridge tasks: dx dy dz (m), rotation vector (rad), gripper (+1 open, -1 closed).
+    """
 
     sequence: int
     action: tuple[float, ...]
@@ -42,7 +47,7 @@ class Step(Numbered):
 
 @dataclass(frozen=True)
 class Save(Numbered):
-    """Keeps the state in a slot until the next Reset."""
+    """Saves the state in a slot until the next Reset."""
 
     sequence: int
     slot: U32
@@ -54,7 +59,7 @@ class Save(Numbered):
 
 @dataclass(frozen=True)
 class Restore(Numbered):
-    """Goes back to the state in a slot, bit by bit."""
+    """Restores the state in a slot, bit-exact."""
 
     sequence: int
     slot: U32

@@ -1,11 +1,14 @@
-"""SIMPLER's episode statistics, judged by the server alone."""
+"""SIMPLER's episode statistics, which only the server computes."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """As of one step; the last step's are the episode's. The last two are ours, not SIMPLER's."""
+    """Flags after a control step; those of the last step are the episode's.
+
+    BridgeEnv documents each flag. SIMPLER has no ever_success and released_success.
+    """
 
     is_success: bool
     is_grasped: bool

@@ -1,6 +1,6 @@
-"""A step's image as the parts of it that changed.
+"""A step's image as the tiles that changed since the last one.
 
-A camera that stands still sees most of its last picture again.
+With a fixed camera most pixels stay the same from step to step.
 """
 
 import functools
@@ -18,16 +18,16 @@ Pixels = NDArray[np.uint8]
 
 
 def changes(last: Pixels, image: Pixels) -> tuple[tuple[int, ...], bytes] | None:
-    """Tiles outside of which image equals last, ascending, and their pixels: the box around them.
+    """The tiles of the box around all changes, in ascending order, and their pixels.
 
-    Both uint8 (height, width, 3). None where the whole image is to be sent: another size, a side
-    that is no multiple of a tile's, or the box is more than half of it.
+    image, last: uint8 (height, width, 3). None if the whole image must be sent: another size, a
+    side that is no multiple of a tile's side, or a box of more than half of the image.
     """
     height, width, _ = image.shape
     if image.shape != last.shape or height % TILE_SIDE or width % TILE_SIDE or not image.size:
         return None
-    # By words of 64 bits, and in few and simple calls: right after a control step each of numpy's
-    # costs as much as what it does. A box holds few tiles that stay the same, and is found sooner.
+    # Compare words of 64 bits in few numpy calls: right after a control step the overhead of a call
+    # is as large as its work. A box has few unchanged tiles and is faster to find than single ones.
     words, before = image.reshape(height, -1).view(np.uint64), last.reshape(height, -1)
     differs = words != before.view(np.uint64)
     flags = differs.tobytes()
@@ -52,7 +52,7 @@ def _numbers(across: int, top: int, bottom: int, left: int, right: int) -> tuple
 
 
 def complete(image: Image, tiles: tuple[int, ...], last: Image) -> Image:
-    """image with all its pixels, where a valid Stepped had those of these tiles only."""
+    """The whole image: `last` with these tiles replaced. ValueError if they do not fit."""
     expected, got = (last.height, last.width), (image.height, image.width)
     if got != expected:
         raise ValueError(
@@ -67,7 +67,7 @@ def complete(image: Image, tiles: tuple[int, ...], last: Image) -> Image:
 
 
 def validate(image: Image, tiles: tuple[int, ...]) -> None:
-    """Tiles' numbers and bytes that fit the size."""
+    """ValueError if the numbers or the bytes of the tiles do not fit the image."""
     image.validate_sides()
     count = (image.height // TILE_SIDE) * (image.width // TILE_SIDE)
     if image.height % TILE_SIDE or image.width % TILE_SIDE or not count:
@@ -93,6 +93,6 @@ def validate(image: Image, tiles: tuple[int, ...]) -> None:
 
 
 def _tiles(image: Pixels) -> Pixels:
-    """The same bytes as (rows of tiles, rows of a tile, columns of tiles, bytes of such a row)."""
+    """A view as (rows of tiles, rows of a tile, columns of tiles, bytes of a row of a tile)."""
     height, width, _ = image.shape
     return image.reshape(height // TILE_SIDE, TILE_SIDE, width // TILE_SIDE, _ROW)

@@ -1,4 +1,4 @@
-"""Types and checks of single values, worded once for every message."""
+"""Types and checks of single values, shared by all messages."""
 
 import math
 import re
@@ -14,17 +14,17 @@ U32 = Annotated[int, Bits(32)]
 
 
 class Numbered:
-    """A message with a number in its session: 1, 2, 3 and so on."""
+    """A message with a sequence number in its session, from 1."""
 
     sequence: int
 
     def validate(self) -> None:
-        """Raises ValueError that names the field, what was expected and what came."""
+        """Raises a ValueError that names the field, the expected and the actual value."""
         sequence(self.sequence, 1)
 
 
 def name(field: str, value: str) -> None:
-    """A name: not empty, not long, and harmless in a terminal."""
+    """A name: not empty, not too long, without control characters."""
     count = len(value.encode())
     if not 1 <= count <= limits.NAME_BYTES_MAX:
         raise ValueError(f"{field}: expected 1 to {limits.NAME_BYTES_MAX} bytes, got {count}")
@@ -34,31 +34,31 @@ def name(field: str, value: str) -> None:
 
 
 def printable(text: str) -> str:
-    """A peer's text for a terminal or a log: without control characters."""
+    """A peer's text without control characters, for a terminal or a log."""
     return _CONTROL.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def text(field: str, value: str) -> None:
-    """A text: not long."""
+    """A text: not too long."""
     count = len(value.encode())
     if count > limits.TEXT_BYTES_MAX:
         raise ValueError(f"{field}: expected at most {limits.TEXT_BYTES_MAX} bytes, got {count}")
 
 
 def elements(field: str, length: int) -> None:
-    """A list that a peer may loop over."""
+    """A list of limited length."""
     if length > limits.ELEMENTS_MAX:
         raise ValueError(f"{field}: expected at most {limits.ELEMENTS_MAX} elements, got {length}")
 
 
 def length(field: str, values: Sized, low: int, high: int) -> None:
-    """A list of so many numbers."""
+    """A list with low to high numbers."""
     if not low <= len(values) <= high:
         raise ValueError(f"{field}: expected {low} to {high} numbers, got {len(values)}")
 
 
 def finite(field: str, values: tuple[float, ...]) -> None:
-    """Numbers without NaN and infinity, nor any that would become infinite in 32 bits."""
+    """Numbers that are finite as 32-bit floats."""
     for index, number in enumerate(values):
         if not math.isfinite(number):
             raise ValueError(f"{field}: expected finite numbers, got {number} at index {index}")
@@ -67,38 +67,38 @@ def finite(field: str, values: tuple[float, ...]) -> None:
 
 
 def positive(field: str, value: float) -> None:
-    """A number above zero."""
+    """A positive number."""
     finite(field, (value,))
     if value <= 0.0:
         raise ValueError(f"{field}: expected a number above 0, got {value:g}")
 
 
 def range(field: str, value: int, low: int, high: int) -> None:
-    """A whole number from low to high, both included."""
+    """A whole number from low to high, inclusive."""
     if not low <= value <= high:
         raise ValueError(f"{field}: expected {low} to {high}, got {value}")
 
 
 def image_sides(fields: tuple[str, str], height: int, width: int) -> None:
-    """Both sides are 0 when no image is wanted."""
+    """An image size; both sides are 0 for no image."""
     if (height, width) != (0, 0):
         range(fields[0], height, 1, limits.IMAGE_SIDE_MAX)
         range(fields[1], width, 1, limits.IMAGE_SIDE_MAX)
 
 
 def sequence(value: int, low: int) -> None:
-    """A request's number; 0 stands in a reply to a request that could not be read."""
+    """A sequence number; 0 is valid only in a reply to a request that could not be read."""
     range("sequence", value, low, limits.SEED_END - 1)
 
 
 def protocol(version: int) -> None:
-    """The version of the peer."""
+    """The protocol version of a peer, which must be this one."""
     if version != PROTOCOL_VERSION:
         raise ValueError(f"expected protocol {PROTOCOL_VERSION}, got protocol {version}")
 
 
 def recognise_protocol(content: object) -> None:
-    """The version of a peer whose message may have other fields than ours."""
+    """The protocol version of a peer, possibly another one with other fields."""
     version = content.get("protocol") if isinstance(content, dict) else None
     if type(version) is int:
         protocol(version)

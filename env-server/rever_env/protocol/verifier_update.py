@@ -1,4 +1,4 @@
-"""A newly trained verifier on its way to the agents."""
+"""VerifierUpdate: a newly trained verifier, published for agents."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from rever_env.protocol import value
 
 @dataclass(frozen=True)
 class VerifierUpdate:
-    """weights: a safetensors file; digest: its SHA-256; policy: whose hidden states it reads."""
+    """weights: a safetensors file. digest: its SHA-256. policy: the digest of its policy."""
 
     name: str
     digest: str

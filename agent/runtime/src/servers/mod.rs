@@ -3,6 +3,7 @@
 //! ```text
 //! installation  the program's own files: a checkout, or unpacked from the program
 //!   python      Python for servers ─▶ packages    system_packages   software OpenGL
+//!     wheel     the Python that rever was installed into by pip
 //!   native      the program rever-simulator       variables         what servers see of the environment
 //! program       a simulator that can be started
 //!   supervisor  its processes: started, watched, started again ─▶ process
@@ -20,6 +21,7 @@ mod source;
 mod supervisor;
 mod system_packages;
 mod variables;
+mod wheel;
 
 pub use installation::{Bundle, Host, Installation, Missing};
 pub use local::{LocalServerOptions, LocalServers};

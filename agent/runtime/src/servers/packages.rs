@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-use anyhow::{Context, Result, anyhow, ensure};
+use anyhow::{Context, Error, Result, anyhow, ensure};
 
 use super::installation::{Installation, Missing};
 use super::python::{PythonEnvironment, last_lines};
@@ -21,6 +21,16 @@ const PYTHON_NAMES: [&str; 7] =
 const PYTHON_VERSIONS_OF_UV: &str = ">=3.10,<3.15";
 const PIP_INSTALL: [&str; 6] =
     ["install", "--quiet", "--no-input", "--disable-pip-version-check", "--require-hashes", "-r"];
+/// What pip and uv print where they reach no package index.
+const NETWORK_WORDS: [&str; 7] = [
+    "ConnectTimeoutError",
+    "Could not connect",
+    "Failed to establish a new connection",
+    "Network is unreachable",
+    "ProxyError",
+    "dns error",
+    "error sending request",
+];
 /// Names what differs from a list of packages. Lines with a condition are for other machines or Pythons.
 const COMPARE_PACKAGES: &str = r"
 import re, sys
@@ -74,7 +84,7 @@ impl PackageList<'_> {
         }
         let start = Instant::now();
         eprintln!("installing Python packages into {} (once)", self.folder.display());
-        self.install()?;
+        self.install().map_err(explain_network)?;
         try_out()?;
         std::fs::write(&stamp, digest)
             .with_context(|| format!("cannot write {}", stamp.display()))?;
@@ -222,6 +232,21 @@ impl PackageList<'_> {
     }
 }
 
+/// Says plainly that the network is missing, in place of what the installer printed for each of its attempts.
+fn explain_network(error: Error) -> Error {
+    let said = format!("{error:#}");
+    let Some(line) = said.lines().find(|line| NETWORK_WORDS.iter().any(|word| line.contains(word)))
+    else {
+        return error;
+    };
+    anyhow!(
+        "cannot reach a package index: is this machine offline? The first start downloads Python packages (HTTPS_PROXY \
+         names a proxy, PIP_INDEX_URL another index); --python names a Python that has them already. The installer's \
+         message: {}",
+        line.trim()
+    )
+}
+
 /// Held until the returned file is closed, so that two programs never install into one folder at
 /// the same time.
 fn lock_folder(folder: &Path) -> Result<File> {
@@ -307,6 +332,21 @@ if [ "$2" = venv ]; then mkdir -p "$last/bin"; cp "$0" "$last/bin/python"; fi
             uv pip install --quiet --compile-bytecode --require-hashes --python venv/bin/python \
             -r list.lock\n";
         assert_eq!((asked.as_str(), is_installed), (expected, true));
+    }
+
+    #[test]
+    fn a_machine_without_network_is_named() {
+        let pip = "python ended with exit status: 1\nWARNING: Retrying (Retry(total=0)) after connection broken by \
+                   'NewConnectionError: Failed to establish a new connection: Name or service not known'\nERROR: No \
+                   matching distribution found for absl-py==2.5.1";
+        let said = explain_network(anyhow!(pip)).to_string();
+        assert!(
+            said.starts_with("cannot reach a package index: is this machine offline?"),
+            "{said}"
+        );
+        assert!(said.contains("Name or service not known") && !said.contains("absl-py"), "{said}");
+        let other = "python ended with exit status: 1\nNo space left on device";
+        assert_eq!(explain_network(anyhow!(other)).to_string(), other);
     }
 
     #[test]

@@ -1,17 +1,19 @@
-//! Python for local servers: an environment of rever's own with pinned packages, and software OpenGL.
+//! Python for local servers: the one that rever was installed into, or an environment of its own with pinned packages; and
+//! software OpenGL.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use sha2::{Digest, Sha256};
 
 use super::installation::{Installation, Missing};
 use super::packages::PackageList;
+use super::program::Simulator;
 use super::system_packages::{GL_PACKAGES, install_missing};
-use super::variables;
+use super::{variables, wheel};
 
 const SERVERS_LOCK: &str = "requirements.lock";
 const SIMULATORS_LOCK: &str = "requirements-simulators.lock";
@@ -26,6 +28,15 @@ world = World(next(iter(tasks.load().values())))
 image = world.reset(layout=0, seed=0).image
 world.close()
 assert image.max() > image.min(), 'the rendered image has one colour only'
+";
+/// Modules of the packages that servers need.
+const SERVERS_MODULES: [&str; 5] = ["mujoco", "numpy", "gymnasium", "zenoh", "msgpack"];
+const ROBOSUITE_MODULE: &str = "robosuite";
+/// Prints the version of this Python, then those of the named modules that it lacks.
+const LACKING_MODULES: &str = "
+import importlib.util, sys
+print('Python %d.%d' % sys.version_info[:2])
+print(*[name for name in sys.argv[1:] if importlib.util.find_spec(name) is None])
 ";
 /// A Python that can run `-m rever_env`.
 #[derive(Debug, Clone)]
@@ -49,6 +60,20 @@ impl PythonEnvironment {
             variables.insert("MESA_SHADER_CACHE_DISABLE".into(), "true".into());
         }
         PythonEnvironment { python, package_root, variables }
+    }
+
+    /// A Python that the user set up. Such an interpreter may need the user's library path.
+    pub(super) fn of_user(
+        python: PathBuf,
+        installation: &Installation,
+        missing: Missing,
+    ) -> PythonEnvironment {
+        let mut environment = PythonEnvironment::new(python, installation, missing);
+        let libraries = OsString::from("LD_LIBRARY_PATH");
+        if let Some(path) = installation.host.variables.get(&libraries) {
+            environment.variables.insert(libraries, path.clone());
+        }
+        environment
     }
 
     /// A command for this Python, with the variables that `rever_env` needs.
@@ -85,6 +110,11 @@ pub fn servers_environment(
     installation: &Installation,
     missing: Missing,
 ) -> Result<PythonEnvironment> {
+    if !installation.is_checkout()
+        && let Some(environment) = wheel::environment(installation, missing)?
+    {
+        return Ok(environment);
+    }
     environment_with(installation, "", &[SERVERS_LOCK], missing)
 }
 
@@ -102,18 +132,46 @@ pub fn development_environment(installation: &Installation) -> Result<PythonEnvi
     environment_with(installation, "", &[SERVERS_LOCK, DEVELOPMENT_LOCK], Missing::Install)
 }
 
-/// A Python of the user's, which has the packages already. Such an interpreter may need the user's library path.
+/// A Python of the user's, which has the packages already; an error says which it lacks, and how to install them.
 pub fn named_environment(
     installation: &Installation,
     python: &Path,
+    simulator: Simulator,
     missing: Missing,
-) -> PythonEnvironment {
-    let mut environment = PythonEnvironment::new(python.to_owned(), installation, missing);
-    let libraries = OsString::from("LD_LIBRARY_PATH");
-    if let Some(path) = installation.host.variables.get(&libraries) {
-        environment.variables.insert(libraries, path.clone());
-    }
-    environment
+) -> Result<PythonEnvironment> {
+    let environment = PythonEnvironment::of_user(python.to_owned(), installation, missing);
+    let is_robosuite = simulator == Simulator::Robosuite;
+    let modules = SERVERS_MODULES.iter().chain(is_robosuite.then_some(&ROBOSUITE_MODULE));
+    let name = python.display();
+    let output = environment.command().args(["-c", LACKING_MODULES]).args(modules).output();
+    let output = output.with_context(|| format!("--python {name}: expected a Python"))?;
+    let said = String::from_utf8_lossy(&output.stdout);
+    let mut lines = said.lines();
+    let version =
+        lines.next().filter(|line| output.status.success() && line.starts_with("Python "));
+    let Some(version) = version else {
+        let said = last_lines(&output);
+        let last = said.lines().next_back().map(|line| format!(": {line}")).unwrap_or_default();
+        bail!("--python {name}: expected a Python, got a program with {}{last}", output.status);
+    };
+    let lacking = lines.next().unwrap_or_default().replace(' ', ", ");
+    let lock = installation.package_root().join(match simulator {
+        Simulator::Robosuite => SIMULATORS_LOCK,
+        Simulator::Python | Simulator::Native => SERVERS_LOCK,
+    });
+    // Files that were unpacked for this command alone are gone when it ends.
+    let install = match installation.is_temporary() {
+        true => String::new(),
+        false => {
+            format!("install its packages with `{name} -m pip install -r {}`, or ", lock.display())
+        }
+    };
+    ensure!(
+        lacking.is_empty(),
+        "--python {name}: {version} lacks {lacking}: {install}leave --python out, and rever sets up a Python \
+         environment of its own"
+    );
+    Ok(environment)
 }
 
 fn environment_with(

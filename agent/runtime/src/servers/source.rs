@@ -160,7 +160,9 @@ impl LocalSource {
     /// The Python that the servers run on, or whose MuJoCo they use.
     pub fn python_environment(&self, missing: Missing) -> Result<PythonEnvironment> {
         match (&self.python, self.simulator) {
-            (Some(python), _) => Ok(named_environment(&self.installation, python, missing)),
+            (Some(python), simulator) => {
+                named_environment(&self.installation, python, simulator, missing)
+            }
             (None, Simulator::Robosuite) => simulators_environment(&self.installation, missing),
             (None, Simulator::Python | Simulator::Native) => {
                 servers_environment(&self.installation, missing)
