@@ -1,4 +1,4 @@
-//! The trace subcommand: every number of episodes, to compare two simulators.
+//! The trace subcommand: prints all numbers of episodes, to compare two simulators.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -32,7 +32,7 @@ pub struct Arguments {
     actions: Option<PathBuf>,
 }
 
-/// Floats stand as their bits, 16 (or 8) hexadecimal digits.
+/// Floats are represented by their bits as 16 (or 8) hexadecimal digits.
 #[derive(Serialize)]
 struct Line<'a> {
     episode: &'a str,
@@ -47,7 +47,7 @@ struct Line<'a> {
 
 type Action = [f32; ACTION_LENGTH];
 
-/// Runs each episode to its horizon or the actions' end.
+/// Runs each episode to its horizon or to the end of the actions.
 pub fn trace(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
     let Arguments { layouts, seeds, side, .. } = arguments;
     let actions = arguments.actions.map(read).transpose()?;
@@ -95,7 +95,7 @@ fn read(file: PathBuf) -> Result<Vec<Action>> {
     let action = |line: &str| -> Result<Action> {
         let numbers = line.split_whitespace().map(str::parse).collect::<Result<Vec<f64>, _>>()?;
         let numbers: [f64; ACTION_LENGTH] = numbers.try_into().map_err(|numbers: Vec<f64>| {
-            anyhow!("expected {ACTION_LENGTH} numbers, got {}: {line:?}", numbers.len())
+            anyhow!("expected {ACTION_LENGTH} numbers per line, got {}: {line:?}", numbers.len())
         })?;
         Ok(numbers.map(|number| number as f32))
     };
