@@ -31,19 +31,19 @@ const CLIENT_WAIT_MS: u32 = 30_000;
 pub struct Arguments {
     #[command(flatten)]
     ways: Ways,
-    /// Serve only these: TASK, TASK/VARIANT or TASK/all; every task in every variant by default.
+    /// Tasks to serve: TASK, TASK/VARIANT or TASK/all; by default all tasks in all variants.
     #[arg(long, num_args = 1.., value_name = "TASK")]
     tasks: Vec<String>,
     /// Namespace: peers see each other only within the same fleet.
     #[arg(long, value_name = "NAME", default_value = "local", value_parser = fleet)]
     fleet: String,
-    /// Largest number of sessions open at the same time.
+    /// Maximum number of concurrent sessions.
     #[arg(
         long, value_name = "COUNT", default_value_t = 16,
         value_parser = clap::value_parser!(u32).range(1..=limits::SESSIONS_MAX.into())
     )]
     sessions: u32,
-    /// Exit when the process with this id is no longer the parent of this one.
+    /// Exit when the process with this id is no longer the parent process.
     #[arg(long, value_name = "PID")]
     exit_with_parent: Option<u32>,
     /// Write the server's id into this file when it is ready.

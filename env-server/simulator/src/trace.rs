@@ -12,22 +12,23 @@ use sha2::{Digest, Sha256};
 use crate::tasks::{self, ACTION_LENGTH, Task};
 use crate::world::World;
 
-/// Print every number of episodes: one JSON object for each reset and each step
+/// Print all numbers of episodes: one JSON object for each reset and each step
 #[derive(Debug, Args)]
 #[group(skip)]
 pub struct Arguments {
-    /// TASK, TASK/VARIANT, TASK/all, or all.
+    /// Tasks to run: TASK, TASK/VARIANT, TASK/all, or all.
     #[arg(long, num_args = 1.., required = true, value_name = "TASK")]
     tasks: Vec<String>,
-    /// Drawn from the seeds if left out.
+    /// Fixed initial layouts; by default, random layouts from the seeds.
     #[arg(long, num_args = 1..)]
     layouts: Vec<u32>,
+    /// Seeds of the episodes.
     #[arg(long, num_args = 1.., default_values_t = [0])]
     seeds: Vec<u64>,
     /// Height and width of the image.
     #[arg(long, default_value_t = 128)]
     side: u32,
-    /// 7 numbers per line; without it the scripted expert acts.
+    /// File with the actions, 7 numbers per line; by default the scripted expert acts.
     #[arg(long, value_name = "FILE")]
     actions: Option<PathBuf>,
 }

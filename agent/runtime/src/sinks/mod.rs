@@ -96,11 +96,11 @@ impl Sinks {
 
     /// Sends an episode's record and waits until it is durable.
     pub async fn record(&self, record: EpisodeRecord) -> Result<()> {
-        let (taken, told) = oneshot::channel();
+        let (taken, handled) = oneshot::channel();
         let event = Event::Recorded(Box::new(record));
         let sent = self.events.send(Message { event, taken: Some(taken) }).await;
         sent.map_err(|_| self.failed())?;
-        told.await.map_err(|_| self.failed())
+        handled.await.map_err(|_| self.failed())
     }
 
     /// Waits until all events are handled.

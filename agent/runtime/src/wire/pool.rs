@@ -24,7 +24,7 @@ use crate::servers::LocalServers;
 use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 
 /// How long a run without sessions waits before it reports what it waits for.
-const WAITING_TOLD: Duration = Duration::from_secs(2);
+const REPORT_AFTER: Duration = Duration::from_secs(2);
 /// If all servers that offer the task are incompatible with the run, how long to wait for another
 /// server.
 const INCOMPATIBLE_WAIT: Duration = Duration::from_secs(2);
@@ -256,11 +256,11 @@ impl Pool {
         let mut state = self.state();
         if state.in_use.values().sum::<usize>() > state.idle.len() + state.opening.len() {
             state.idle_since = None;
-            state.is_waiting_told = false;
+            state.is_reported = false;
             return Ok(());
         }
         let waits = *state.idle_since.get_or_insert_with(Instant::now);
-        if waits.elapsed() >= WAITING_TOLD && !std::mem::replace(&mut state.is_waiting_told, true) {
+        if waits.elapsed() >= REPORT_AFTER && !std::mem::replace(&mut state.is_reported, true) {
             tracing::warn!(
                 "waiting for a session of task {}: {}",
                 request.task,

@@ -47,7 +47,7 @@ pub struct State {
     /// When this run last became idle, without any session in use.
     pub idle_since: Option<Instant>,
     /// Whether the reason for waiting was reported.
-    pub is_waiting_told: bool,
+    pub is_reported: bool,
 }
 
 /// A server that is skipped for a while.

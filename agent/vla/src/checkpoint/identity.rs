@@ -1,9 +1,9 @@
 //! A checkpoint's identity: a digest of what it computes, independent of how its files are written.
 //!
-//! Two folders have the same identity if the following have equal values: the configuration with
-//! defaults filled in and only the selected dataset's statistics, the tokenizer, and the weights in
-//! use. Shards, key order, indentation, the dtype of the weights, comments and unused fields do not
-//! matter.
+//! Two folders have the same identity exactly if the following have equal values: the configuration
+//! with defaults filled in and only the selected dataset's statistics, the tokenizer, and the
+//! weights in use. Shards, key order, indentation, the dtype of the weights, comments and unused
+//! fields do not matter.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};

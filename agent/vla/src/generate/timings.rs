@@ -22,7 +22,7 @@ pub fn measure(
     candidates: usize,
     tokens: usize,
 ) -> Result<Timings> {
-    // In the same way as `WorkerPools::complete` runs a single pool.
+    // As in `WorkerPools::complete` without dividing the sessions.
     rayon::scope(|_| measure_inside(network, contexts, candidates, tokens))
 }
 
