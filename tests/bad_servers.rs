@@ -1,4 +1,4 @@
-//! Servers that do not keep to the protocol cost their own episodes and nobody else's, and are named as what they are.
+//! Servers that violate the protocol affect only their own episodes and are reported as faulty.
 
 use std::collections::BTreeSet;
 use std::process::Output;
@@ -24,12 +24,12 @@ use crate::harness::{rever, run, text};
 use crate::server::{Server, free_endpoint, open_router};
 
 const EPISODES: u32 = 6;
-/// Longest wait for a run that takes seconds on a machine with nothing else to do.
+/// Maximum wait for a run that takes seconds on an idle machine.
 const WAIT: Duration = Duration::from_secs(120);
-/// A run without a session gives up after this long, unless the test says otherwise.
+/// A run without a session gives up after this time, unless the test sets another one.
 const FIRST_SESSION_WAIT: Duration = Duration::from_secs(60);
 
-/// Keeps the servers of recorded episodes and the reasons of faults.
+/// Collects the servers of recorded episodes and the reasons of faults.
 #[derive(Clone, Default)]
 struct Kept(Arc<Mutex<(Vec<String>, Vec<String>)>>);
 
@@ -45,7 +45,8 @@ impl EventSink for Kept {
     }
 }
 
-/// Runs episodes on a healthy server and one with a defect; the reasons of the faults on the way.
+/// Runs episodes on a correct server and on one with a defect; returns the reasons of the faults
+/// and the duration.
 async fn run_beside(fleet: &str, defect: &str, timing: Timing) -> (Vec<String>, Duration) {
     let endpoint = free_endpoint();
     let router = open_router(&endpoint).await;
@@ -58,7 +59,7 @@ async fn run_beside(fleet: &str, defect: &str, timing: Timing) -> (Vec<String>, 
     let kept = Kept::default();
     let rollout = rollout(&network, FIRST_SESSION_WAIT, &kept);
     let begun = Instant::now();
-    tokio::time::timeout(WAIT, rollout.run()).await.expect("in time").expect("the run goes on");
+    tokio::time::timeout(WAIT, rollout.run()).await.expect("in time").expect("the run continues");
     let took = begun.elapsed();
     network.close().await.expect("the network closes");
     router.close().await.expect("the router closes");
@@ -67,7 +68,7 @@ async fn run_beside(fleet: &str, defect: &str, timing: Timing) -> (Vec<String>, 
     (kept.1.clone(), took)
 }
 
-/// Episodes of a scripted policy, three at once.
+/// Episodes of a scripted policy, three at a time.
 fn rollout(network: &Network, wait: Duration, kept: &Kept) -> Rollout<ZenohPool> {
     let plan = |episode| EpisodePlan {
         task: TaskId::default_of("widowx_spoon_on_towel"),
@@ -82,7 +83,7 @@ fn rollout(network: &Network, wait: Duration, kept: &Kept) -> Rollout<ZenohPool>
     let decider = Arc::new(Decider::new(Arc::new(ScriptedPolicy::new())));
     let pool = pool_options(decider.policy().info(), "test".to_owned(), None);
     let pool = PoolOptions { wait, first_wait: wait, ..pool };
-    // Their senders are gone, and with them every change.
+    // Their senders were dropped, so these values never change.
     let (_, stop) = watch::channel(Stop::No);
     let (_, scorer) = watch::channel(None);
     Rollout {
@@ -133,7 +134,7 @@ fn versions() -> Versions {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_that_never_answers_open_holds_up_no_episode_of_others() {
+async fn a_server_that_never_replies_to_open_delays_no_other_episodes() {
     let timing = Timing { open_max: WAIT, ..Timing::default() };
     let (faults, took) = run_beside("never-opens", "never_opens", timing).await;
     assert!(took < WAIT / 2, "the healthy server's episodes took {took:?}");
@@ -141,7 +142,7 @@ async fn a_server_that_never_answers_open_holds_up_no_episode_of_others() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_run_that_finds_every_session_in_use_ends_in_time_and_says_so() {
+async fn a_run_ends_with_a_reason_if_all_sessions_stay_in_use() {
     let endpoint = free_endpoint();
     let router = open_router(&endpoint).await;
     let server = Server::start_behind_router(&endpoint, "full", &["--sessions=1"]);
@@ -160,16 +161,16 @@ async fn a_run_that_finds_every_session_in_use_ends_in_time_and_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_that_does_not_answer_a_step_costs_its_own_episodes() {
+async fn a_server_that_does_not_reply_to_a_step_affects_only_its_own_episodes() {
     let timing = Timing { reply_max: Duration::from_secs(4), ..Timing::default() };
     let (faults, _) = run_beside("never-steps", "never_steps", timing).await;
     assert!(!faults.is_empty());
-    let is_named = |fault: &String| fault.contains("is alive but did not answer Step for 4 s");
+    let is_named = |fault: &String| fault.contains("is alive but did not reply to Step for 4 s");
     assert!(faults.iter().all(is_named), "{faults:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_whose_episodes_do_not_end_is_held_to_its_description() {
+async fn a_server_whose_episodes_exceed_their_horizon_is_at_fault() {
     let (faults, _) = run_beside("never-ends", "never_ends", Timing::default()).await;
     assert!(!faults.is_empty());
     let is_named = |fault: &String| fault.contains("to end after 60 steps");
@@ -177,13 +178,13 @@ async fn a_server_whose_episodes_do_not_end_is_held_to_its_description() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_with_an_unreadable_description_is_left_out() {
+async fn a_server_with_an_invalid_description_is_ignored() {
     let (faults, _) = run_beside("unreadable", "describes_nonsense", Timing::default()).await;
     assert!(faults.is_empty(), "{faults:?}");
 }
 
 #[test]
-fn a_server_that_cannot_be_understood_is_named_as_what_it_is() {
+fn a_server_with_invalid_messages_is_reported() {
     let endpoint = free_endpoint();
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     let router = runtime.block_on(open_router(&endpoint));
@@ -196,7 +197,7 @@ fn a_server_that_cannot_be_understood_is_named_as_what_it_is() {
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("no environment server found"), "{said}");
     assert!(said.contains(&format!("server {}", server.id)), "{said}");
-    assert!(said.contains("its description cannot be read"), "{said}");
+    assert!(said.contains("invalid description"), "{said}");
     runtime.block_on(async { router.close().await }).expect("the router closes");
 }
 
@@ -223,19 +224,19 @@ async fn a_reply_that_precedes_its_request_is_refused() {
         }
     };
     let EnvironmentFault::Wire { reason } = &fault else { panic!("expected a fault, got {fault}") };
-    assert!(reason.contains("to come before its reply"), "{reason}");
+    assert!(reason.contains("before it was sent"), "{reason}");
     router.close().await.expect("the router closes");
 }
 
 #[test]
-fn what_a_server_tells_wrongly_at_every_heartbeat_is_said_a_few_times() {
+fn a_repeated_defect_of_heartbeats_is_reported_a_few_times() {
     let (output, server) = evaluate_on("beats", "beats_wildly", &["--tasks=widowx_stack_cube"]);
     let said = text(&output);
     assert!(output.status.success(), "{said}");
     let unreadable = format!("server {server}: heartbeat cannot be read");
     assert_eq!(said.matches(&unreadable).count(), 1, "{said}");
     // Once per doubling.
-    let growing = said.matches(&format!("server {server} holds")).count();
+    let growing = said.matches(&format!("server {server} uses")).count();
     assert!((1..8).contains(&growing), "{said}");
     assert!(!said.contains("ERROR"), "{said}");
 }
@@ -250,7 +251,8 @@ fn a_task_that_no_server_offers_is_refused_and_leaves_no_run() {
     assert!(!said.contains("rerun"), "{said}");
 }
 
-/// Evaluates one episode on a server with a defect; what the program said, and the server's id.
+/// Evaluates one episode on a server with a defect; returns the program's output and the server's
+/// id.
 fn evaluate_on(fleet: &str, defect: &str, arguments: &[&str]) -> (Output, String) {
     let endpoint = free_endpoint();
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");

@@ -1,4 +1,4 @@
-//! What `rever bench` prints and refuses; how fast anything is, no test says.
+//! The output and the errors of `rever bench`. No test checks how fast anything is.
 
 use std::path::Path;
 use std::process::Command;
@@ -58,7 +58,7 @@ fn a_benchmark_of_the_wire_takes_the_simulator_out_of_a_step() {
     let rows = rows(&file);
     let counts: Vec<_> =
         rows.iter().map(|row| (row["simulator"].as_str(), row["steps"].as_u64())).collect();
-    // 60 steps of each session; an episode that is over is begun anew.
+    // 60 steps per session; an episode that ends is followed by a new one.
     let expected = [("native", 60), ("native", 300), ("python", 60), ("python", 300)];
     assert_eq!(counts, expected.map(|(simulator, steps)| (Some(simulator), Some(steps))));
     for row in rows {
@@ -79,8 +79,8 @@ fn rows(file: &Path) -> Vec<Value> {
 }
 
 #[test]
-fn a_python_without_pytorch_is_refused_in_words() {
-    // `true` starts, and says nothing that PyTorch's side would say.
+fn a_python_without_pytorch_is_refused_with_a_reason() {
+    // `true` starts, but does not print what the PyTorch program prints.
     let output = run(rever().args(["bench", "decision", "--compare", "--python", "true"]));
     assert_eq!(output.status.code(), Some(1), "{}", text(&output));
     let text = text(&output);
@@ -90,7 +90,7 @@ fn a_python_without_pytorch_is_refused_in_words() {
 }
 
 #[test]
-fn a_device_that_is_not_there_is_refused_in_words() {
+fn a_missing_device_is_refused_with_a_reason() {
     let output = run(rever().args(["bench", "decision", "--device", "gpu"]));
     assert_eq!(output.status.code(), Some(2), "{}", text(&output));
     assert!(text(&output).contains("expected cpu, cuda or cuda:N, got gpu"), "{}", text(&output));

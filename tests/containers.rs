@@ -1,4 +1,4 @@
-//! The container files: accepted by docker, and of one mind with the rest of the repository.
+//! The container files: docker accepts them, and they agree with the rest of the repository.
 
 use std::process::Command;
 
@@ -19,7 +19,7 @@ fn docker_accepts_the_compose_file() {
 }
 
 #[test]
-fn router_agent_and_servers_speak_the_same_zenoh() {
+fn router_agent_and_servers_use_the_same_zenoh_version() {
     let router = after(&read("docker-compose.yml"), "image: eclipse/zenoh:");
     let server = after(&read("env-server/requirements.lock"), "eclipse-zenoh==");
     let agent = after(&read("Cargo.lock"), "name = \"zenoh\"\nversion = \"");
@@ -39,7 +39,7 @@ fn read(path: &str) -> String {
         .unwrap_or_else(|error| panic!("{path}: {error}"))
 }
 
-/// The version number that follows `mark`.
+/// The version number after `mark`.
 fn after(text: &str, mark: &str) -> String {
     let (_, rest) = text.split_once(mark).unwrap_or_else(|| panic!("no {mark:?} was found"));
     rest.chars().take_while(|character| character.is_ascii_digit() || *character == '.').collect()

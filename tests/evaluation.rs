@@ -1,4 +1,4 @@
-//! A real evaluation by the built program: started, watched, killed, and read afterwards.
+//! An evaluation by the built program: started, watched, killed, and read.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use store::record::EpisodeRecord;
 
 use crate::harness::{python, rever, run, text, wait_for};
 
-/// Longest wait for an event of an evaluation that takes seconds on a machine with nothing else to do.
+/// Maximum wait for an event of an evaluation that takes seconds on an idle machine.
 pub const WAIT: Duration = Duration::from_secs(600);
 
 /// The arguments and the files of one run.
@@ -19,19 +19,19 @@ pub struct Evaluation {
     arguments: Vec<String>,
 }
 
-/// The program at work; killed when dropped.
+/// The running program; killed when dropped.
 pub struct Running {
     child: Child,
 }
 
 impl Evaluation {
-    /// `rever evaluate` with these arguments; all its files lie in `folder`.
+    /// `rever evaluate` with these arguments; all its files are in `folder`.
     pub fn new(folder: &Path, arguments: &[&str]) -> Evaluation {
         let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
         Evaluation { folder: folder.to_owned(), arguments }
     }
 
-    /// The run's folder.
+    /// The folder of the run.
     pub fn run_folder(&self) -> PathBuf {
         self.folder.join("run")
     }
@@ -41,7 +41,7 @@ impl Evaluation {
         self.folder.join("labels.sqlite")
     }
 
-    /// Runs to the end and gives the result file.
+    /// Runs to the end and returns the result file.
     pub fn finish(&self) -> Value {
         let mut command = self.command();
         let output = run(&mut command);
@@ -51,7 +51,8 @@ impl Evaluation {
         serde_json::from_slice(&json).expect("the result file is JSON")
     }
 
-    /// Starts and comes back at once. What it says is kept in a file, for a pipe would fill up.
+    /// Starts the program without waiting for it. Its output goes to a file, because a pipe would
+    /// fill up.
     pub fn start(&self) -> Running {
         let said =
             std::fs::File::create(self.folder.join("said.txt")).expect("a file for its words");
@@ -60,7 +61,7 @@ impl Evaluation {
         Running { child: command.stdin(Stdio::null()).spawn().expect("the program starts") }
     }
 
-    /// Waits until at least `count` episodes are recorded while the program runs.
+    /// Waits until at least `count` episodes are recorded by the running program.
     pub fn wait_for_records(&self, running: &mut Running, count: usize) {
         wait_for(&format!("{count} records"), WAIT, || {
             let ended = running.child.try_wait().expect("a child can be asked");
@@ -70,7 +71,7 @@ impl Evaluation {
         });
     }
 
-    /// The bytes of every record by file name.
+    /// The bytes of every record by its file name.
     pub fn record_files(&self) -> BTreeMap<String, Vec<u8>> {
         let Ok(entries) = std::fs::read_dir(self.run_folder().join("episodes")) else {
             return BTreeMap::new();
@@ -85,7 +86,7 @@ impl Evaluation {
             .collect()
     }
 
-    /// Every record by episode id.
+    /// Every record by its episode id.
     pub fn records(&self) -> BTreeMap<String, EpisodeRecord> {
         let read = |name: &String| {
             let path = self.run_folder().join("episodes").join(name);
@@ -95,7 +96,7 @@ impl Evaluation {
         self.record_files().keys().map(read).collect()
     }
 
-    /// What the program has said since it was started.
+    /// The program's output since its start.
     pub fn words(&self) -> String {
         std::fs::read_to_string(self.folder.join("said.txt")).unwrap_or_default()
     }
@@ -114,20 +115,20 @@ impl Evaluation {
 }
 
 impl Running {
-    /// As a crash would: nothing is cleaned up.
+    /// Kills it without any cleanup, like a crash.
     pub fn kill(mut self) {
         self.child.kill().expect("the program runs");
         self.child.wait().expect("a killed program ends");
     }
 
-    /// Waits until it has ended by itself, and tells whether it succeeded.
+    /// Waits until it has ended by itself; returns whether it succeeded.
     pub fn succeeds(mut self) -> bool {
         let ended =
             wait_for("its end", WAIT, || self.child.try_wait().expect("a child can be asked"));
         ended.success()
     }
 
-    /// The server processes that it has started and that run now.
+    /// The running server processes that it has started.
     pub fn servers(&self) -> Vec<u32> {
         let listed = std::fs::read_dir("/proc").expect("Linux lists its processes");
         let ids = listed.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
@@ -149,7 +150,7 @@ pub fn is_alive(process: u32) -> bool {
     state.is_some_and(|state| state != 'Z')
 }
 
-/// As a crash would.
+/// Kills a process without any cleanup, like a crash.
 pub fn kill(process: u32) {
     let killed = Command::new("kill").args(["-KILL", &process.to_string()]).status();
     assert!(killed.is_ok_and(|status| status.success()), "process {process} is there to be killed");
@@ -159,7 +160,7 @@ fn parent_of(process: u32) -> Option<u32> {
     status_of(process)?.split(' ').nth(1)?.parse().ok()
 }
 
-/// What /proc says after the process's name, which may hold spaces: state, parent and more.
+/// The text in /proc after the process's name, which may contain spaces: state, parent and more.
 fn status_of(process: u32) -> Option<String> {
     let line = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
     line.rsplit_once(") ").map(|(_, status)| status.to_owned())

@@ -1,4 +1,4 @@
-//! What every test of the processes needs: the built program, Python, and waits with a limit.
+//! Shared by all tests of processes: the built program, Python, and waits with a limit.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -10,7 +10,7 @@ use runtime::servers::{
     development_environment,
 };
 
-/// How often a condition is looked at while a test waits for it.
+/// How often a condition is checked while a test waits for it.
 const LOOK_MS: u64 = 20;
 
 /// The root of this checkout.
@@ -18,15 +18,15 @@ pub fn repository() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the crate lies in the repository")
 }
 
-/// The program, built once with the profile of this test. Cargo builds it only for the crate that
-/// holds it, and tells its path to no other.
+/// The program, built once with the profile of this test. Cargo builds it only for its own crate
+/// and passes its path to no other.
 pub fn rever() -> Command {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     Command::new(PROGRAM.get_or_init(|| {
         let test = std::env::current_exe().expect("this test runs from a file");
         let folder = test.ancestors().nth(2).expect("tests lie in target/<profile>/deps");
         let mut build = cargo();
-        // With the whole workspace, features are resolved as they were for this test, so that no
+        // Building the whole workspace resolves the same features as for this test, so that no
         // dependency is built a second time.
         build.args(["build", "--quiet", "--workspace", "--bin", "rever"]);
         if folder.ends_with("release") {
@@ -56,14 +56,14 @@ pub fn installation() -> Installation {
     Installation::checkout(repository(), &Host { variables, ..Host::default() })
 }
 
-/// A simulator, installed or built if need be.
+/// A simulator; it is installed or built if necessary.
 pub fn simulator(simulator: Simulator) -> ServerProgram {
     let python = (simulator != Simulator::Robosuite).then(|| python().python.clone());
     let local = LocalSource { count: 1, simulator, python, installation: installation() };
     local.program(Missing::Install).expect("the simulator can be started")
 }
 
-/// Runs the command to its end and returns its standard output.
+/// Runs the command to its end, checks that it succeeds and returns its standard output.
 pub fn succeed(command: &mut Command) -> String {
     let output = run(command);
     assert!(output.status.success(), "{command:?} ended with {}\n{}", output.status, text(&output));
@@ -75,13 +75,13 @@ pub fn run(command: &mut Command) -> Output {
     command.output().unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"))
 }
 
-/// All that a command said.
+/// The complete output of a command.
 pub fn text(output: &Output) -> String {
     let (stdout, stderr) = (&output.stdout, &output.stderr);
     format!("{}{}", String::from_utf8_lossy(stdout), String::from_utf8_lossy(stderr))
 }
 
-/// Waits until the condition gives a value, and fails after the limit.
+/// Waits until the condition returns a value; fails after the limit.
 pub fn wait_for<T>(what: &str, limit: Duration, mut condition: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + limit;
     loop {

@@ -1,4 +1,5 @@
-//! A verifier published while a run goes on is taken up between two episodes, never inside one.
+//! A verifier that is published during a run is used from the next episode on, never within an
+//! episode.
 
 use std::path::Path;
 
@@ -14,12 +15,12 @@ use crate::harness::{repository, wait_for};
 use crate::server::free_endpoint;
 
 const EPISODES: usize = 6;
-/// Of the policy that comes with the program.
+/// Digest of the shipped policy.
 const HIDDEN_SIZE: usize = 256;
 const ACTION_LENGTH: usize = 7;
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_published_verifier_is_taken_up_between_episodes() {
+async fn a_published_verifier_is_used_from_the_next_episode_on() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = repository().join("agent/models/bridge-small");
     let policy = CompletionParser::load(&model).expect("a policy");
@@ -38,7 +39,7 @@ async fn a_published_verifier_is_taken_up_between_episodes() {
     publisher.publish(policy.digest(), second.bytes().to_vec()).await.expect("it is published");
     assert!(running.succeeds(), "{}", evaluation.words());
 
-    // One session at a time: episodes are numbered in the order in which they ran.
+    // With one session, episodes are numbered in the order in which they run.
     let used: Vec<_> =
         evaluation.records().into_values().filter_map(|record| record.versions.verifier).collect();
     let change = used.iter().position(|digest| digest == second.digest());
@@ -50,7 +51,7 @@ async fn a_published_verifier_is_taken_up_between_episodes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_verifier_of_another_policy_is_not_taken_for_the_first() {
+async fn a_verifier_of_another_policy_is_not_used() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = repository().join("agent/models/bridge-small");
     let policy = CompletionParser::load(&model).expect("a policy");
@@ -89,7 +90,7 @@ fn evaluation(folder: &Path, endpoint: &str, more: &[&str]) -> Evaluation {
     Evaluation::new(folder, &[&arguments, more].concat())
 }
 
-/// Fitted to random numbers: what it says does not matter here, only which one it is.
+/// A verifier fitted to random numbers: only its identity matters here, not its scores.
 fn verifier(policy: &str, seed: u64) -> Verifier {
     let size = HIDDEN_SIZE;
     let episodes = (0..20).map(|number| {

@@ -1,10 +1,10 @@
-//! Formats, lints and types of both languages; a warning fails.
+//! Formatting, lints and types of both languages; a warning fails the test.
 
 use runtime::servers::libmujoco;
 
 use crate::harness::{cargo, python, repository, succeed};
 
-/// The folders with Python in them.
+/// The folders that contain Python code.
 const PYTHON_FOLDERS: [&str; 3] = ["env-server", "agent/training", "tests"];
 
 #[test]
@@ -36,19 +36,19 @@ fn python_is_formatted_and_has_no_warnings() {
 }
 
 #[test]
-fn python_types_are_right() {
+fn python_types_are_correct() {
     let mut mypy = python().command();
     mypy.current_dir(repository().join("env-server"));
     succeed(mypy.args(["-m", "mypy", "--strict", "rever_env", "tests", "env.py"]));
 }
 
 #[test]
-fn types_of_the_training_are_right_as_far_as_they_are_known() {
+fn types_of_the_training_are_correct_without_pytorch() {
     let mut mypy = python().command();
     mypy.current_dir(repository().join("agent/training"));
     mypy.args(["-m", "mypy", "--strict", "."]);
-    // PyTorch is several times larger than all else that the tests install. Without it, what comes
-    // from it is of any type.
+    // PyTorch is several times larger than everything else that the tests install. Without it, its
+    // values have any type.
     mypy.args(["--ignore-missing-imports", "--no-warn-unused-ignores", "--no-warn-return-any"]);
     succeed(mypy.args(["--allow-subclassing-any", "--allow-untyped-decorators"]));
 }

@@ -1,4 +1,4 @@
-//! Real servers of this machine that freeze: noticed by their heartbeats, killed, and replaced.
+//! Local servers that freeze: detected by their heartbeats, killed, and replaced.
 
 use std::path::Path;
 use std::time::Duration;
@@ -10,9 +10,9 @@ use tokio::runtime::Runtime;
 
 use crate::harness::{simulator, wait_for};
 
-/// Longest wait for an event that takes seconds on a machine with nothing else to do.
+/// Maximum wait for an event that takes seconds on an idle machine.
 const WAIT: Duration = Duration::from_secs(120);
-/// A server beats twice a second.
+/// A server sends two heartbeats per second.
 const SILENCE_MAX: Duration = Duration::from_secs(15);
 
 #[test]

@@ -1,12 +1,13 @@
-//! The processes together. One binary: each file under `tests/` would be linked again on its own.
+//! The integration tests in one binary, because each file under `tests/` would otherwise be linked
+//! separately.
 
-// What the tests below share: the built program, a run of it, a server, a bad wire.
+// Shared by the tests below: the built program, a run of it, a server, an unreliable network.
 mod evaluation;
 mod harness;
 mod relay;
 mod server;
 
-// The repository: its text, its README, its formats, lints and types.
+// The repository: its text, its README, its formatting, lints and types.
 mod lints;
 mod readme;
 mod tidy;
@@ -14,31 +15,32 @@ mod tidy;
 // The container files.
 mod containers;
 
-// The Python package's own tests.
+// The Python package's tests.
 mod python;
 
-// The real client against real servers, on good wires and bad ones; servers that do not keep to the protocol.
+// The real client and real servers, on reliable and unreliable networks; servers that violate the
+// protocol.
 mod bad_servers;
 mod wire;
 
-// Outcomes for observers, verifiers for followers.
+// Outcomes for observers, verifiers for subscribers.
 mod published;
 
-// The native simulator beside the Python one, and the test of servers.
+// The native simulator compared with the Python one; conformance tests.
 mod simulators;
 
-// The program away from its checkout; servers of this machine that freeze.
+// The program outside its checkout; local servers that freeze.
 mod installation;
 mod local_servers;
 
 // The command line: wrong usage, help, lists, Ctrl-C.
 mod command_line;
 
-// Evaluations with the models that come with the program: results, kills, faults, the report.
+// Evaluations with the shipped models: results, killed processes, faults, the report.
 mod whole_loop;
 
-// What decisions cost.
+// The time of decisions.
 mod bench;
 
-// A new verifier while a run goes on.
+// A new verifier during a run.
 mod hot_swap;

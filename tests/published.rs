@@ -1,4 +1,4 @@
-//! What is published: outcomes for observers, verifiers for those who follow one.
+//! Published messages: outcomes for observers, verifiers for subscribers.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use runtime::wire::{
     Network, NetworkOptions, OutcomePublisher, VerifierPublisher, VerifierSubscriber,
 };
 
-/// Longest wait for what takes a moment; a test machine may be busy.
+/// Maximum wait for an event that is nearly immediate on an idle machine.
 const WAIT: Duration = Duration::from_secs(60);
 
 async fn listen(fleet: &str) -> Network {
@@ -16,7 +16,7 @@ async fn listen(fleet: &str) -> Network {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_outcome_reaches_an_observer_and_waits_for_none() {
+async fn an_outcome_reaches_an_observer_but_does_not_wait_for_one() {
     let source = listen("outcomes").await;
     let publisher = OutcomePublisher::declare(&source, "run-1").await.expect("a publisher");
     publisher.publish(&outcome("run-1", 0)).expect("without any observer");
@@ -32,7 +32,7 @@ async fn an_outcome_reaches_an_observer_and_waits_for_none() {
     let observer = zenoh::open(configuration).await.expect("the observer connects");
     let outcomes =
         observer.declare_subscriber("rever/3/outcomes/outcome/*").await.expect("a subscriber");
-    // The subscription travels to the publisher; until it is there, outcomes are nobody's.
+    // The subscription must reach the publisher; earlier outcomes are lost.
     let seen = async {
         loop {
             publisher.publish(&outcome("run-1", 7)).expect("published");
@@ -68,7 +68,7 @@ fn outcome(run: &str, episode: u32) -> EpisodeOutcome {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_last_verifier_is_kept_for_late_comers() {
+async fn the_last_verifier_is_kept_for_late_subscribers() {
     let source = listen("verifiers").await;
     let connect = source.listening().to_vec();
     let options =

@@ -1,4 +1,4 @@
-//! The tests of the Python package.
+//! Runs the tests of the Python package.
 
 use std::io::Write;
 
@@ -24,7 +24,8 @@ fn pytest(environment: &PythonEnvironment, files: &[&str]) {
     let mut pytest = environment.command();
     pytest.current_dir(repository().join("env-server"));
     let said = succeed(pytest.args(["-m", "pytest", "--quiet"]).args(files));
-    // Written past the capture of the test runner, so that every run shows how many tests passed.
+    // Written past the output capture of the test runner, so that every run shows how many tests
+    // passed.
     let closing = said.lines().next_back().unwrap_or_default();
     writeln!(std::io::stderr(), "pytest: {closing}").expect("standard error is open");
 }

@@ -1,4 +1,4 @@
-//! A bad wire: everything between one fleet and another goes through here, and not all of it arrives.
+//! An unreliable network: a relay between two fleets that loses, repeats and delays messages.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -11,18 +11,19 @@ use zenoh::liveliness::LivelinessToken;
 use zenoh::query::Query;
 use zenoh::sample::{Sample, SampleKind};
 
-/// How bad the wire is, in parts of a thousand.
+/// How unreliable the relay is; shares are in parts per thousand.
 #[derive(Clone, Copy)]
 pub struct Badness {
-    /// Messages that do not arrive.
+    /// Messages that are lost.
     pub dropped: u64,
-    /// Messages that arrive twice.
+    /// Messages that are sent twice.
     pub doubled: u64,
-    /// Longest delay in milliseconds; each copy has its own, so that they overtake each other.
+    /// Maximum delay in milliseconds. Each copy has its own delay, so that they overtake each
+    /// other.
     pub delay_ms_max: u64,
 }
 
-/// What the wire has done.
+/// What the relay has done so far.
 #[derive(Default)]
 pub struct Deeds {
     pub dropped: AtomicUsize,
@@ -30,7 +31,8 @@ pub struct Deeds {
     pub overtaken: AtomicUsize,
 }
 
-/// Carries requests from the fleet `agents` to the fleet `servers`, and replies back.
+/// Relays requests from the fleet `agents` to the fleet `servers`, and replies in the opposite
+/// direction.
 pub struct Relay {
     session: Session,
     wire: Arc<Wire>,
@@ -42,16 +44,16 @@ struct Wire {
     badness: Badness,
     random: Mutex<u64>,
     deeds: Deeds,
-    /// Nothing but liveliness passes: what a stuck simulation looks like from afar.
+    /// Relays only liveliness, as if the simulation were stuck.
     stuck: AtomicBool,
-    /// Messages in the order of their sending, and the last one that arrived.
+    /// Number of messages sent, and the last one that arrived.
     sent: AtomicUsize,
     arrived: AtomicUsize,
     tokens: Mutex<HashMap<String, LivelinessToken>>,
 }
 
 impl Relay {
-    /// Listens on `endpoint`; agents and servers connect to it.
+    /// Listens on `endpoint`, to which agents and servers connect.
     pub async fn start(endpoint: &str, seed: u64, badness: Badness) -> Self {
         let mut configuration = zenoh::Config::default();
         let endpoints = format!("[\"{endpoint}\"]");
@@ -88,7 +90,7 @@ impl Relay {
         &self.wire.deeds
     }
 
-    /// From now on only liveliness passes.
+    /// From now on relays only liveliness.
     pub fn get_stuck(&self) {
         self.wire.stuck.store(true, Ordering::SeqCst);
     }
@@ -183,7 +185,7 @@ impl Wire {
                 if wire.arrived.fetch_max(number, Ordering::SeqCst) > number {
                     wire.deeds.overtaken.fetch_add(1, Ordering::SeqCst);
                 }
-                // The relay may be closed by now, with late copies on their way.
+                // The relay may already be closed when late copies are sent.
                 let _ = wire.session.put(key, payload).await;
             });
         }

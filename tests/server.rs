@@ -1,4 +1,4 @@
-//! A server process for a test: ended with the test, killed when the test says so.
+//! A server process for a test: ends with the test, or is killed by it.
 
 use std::io::{BufRead, BufReader};
 use std::net::{Ipv4Addr, TcpListener};
@@ -6,22 +6,22 @@ use std::process::{Child, Stdio};
 
 use crate::harness::{python, repository};
 
-/// Running until it is dropped.
+/// A server that runs until it is dropped.
 pub struct Server {
     child: Child,
     /// The server's id.
     pub id: String,
-    /// Where it listens, beside what it connects to.
+    /// The endpoint on which it listens, in addition to the one that it connects to.
     pub endpoint: String,
 }
 
-/// An endpoint of this machine alone that nobody uses now.
+/// A loopback endpoint that is not in use.
 pub fn free_endpoint() -> String {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("there is a free port");
     format!("tcp/{}", listener.local_addr().expect("a bound listener has an address"))
 }
 
-/// A zenoh router in this process, as `zenohd` is one in its own.
+/// A zenoh router in this process, equivalent to a `zenohd` process.
 pub async fn open_router(endpoint: &str) -> zenoh::Session {
     let mut configuration = zenoh::Config::default();
     for (key, value) in [
@@ -35,20 +35,20 @@ pub async fn open_router(endpoint: &str) -> zenoh::Session {
 }
 
 impl Server {
-    /// Starts a server that connects to `connect`, and waits until it says that it is ready.
+    /// Starts a server that connects to `connect`, and waits until it is ready.
     pub fn start(connect: &str, fleet: &str, arguments: &[&str]) -> Self {
         let endpoint = free_endpoint();
         let arguments = [&["--fleet", fleet, "--listen", &endpoint], arguments].concat();
         Self::start_with(&["-m", "rever_env"], connect, &arguments, &endpoint)
     }
 
-    /// The same, listening nowhere: for a router that `connect` names.
+    /// The same without listening, for a router at `connect`.
     pub fn start_behind_router(connect: &str, fleet: &str, arguments: &[&str]) -> Self {
         let arguments = [&["--fleet", fleet], arguments].concat();
         Self::start_with(&["-m", "rever_env"], connect, &arguments, connect)
     }
 
-    /// One with a defect of `broken_server.py`.
+    /// A server with a defect of `broken_server.py`.
     pub fn start_broken_behind_router(connect: &str, fleet: &str, defect: &str) -> Self {
         let script = repository().join("tests/broken_server.py");
         let program = [script.to_str().expect("a path in UTF-8"), defect];
@@ -75,7 +75,7 @@ impl Server {
         Self { child, id, endpoint: endpoint.to_owned() }
     }
 
-    /// As a crash would: nothing is cleaned up.
+    /// Kills it without any cleanup, like a crash.
     pub fn kill(&mut self) {
         self.child.kill().expect("the server runs");
         self.child.wait().expect("a killed child ends");
@@ -84,7 +84,7 @@ impl Server {
 
 impl Drop for Server {
     fn drop(&mut self) {
-        // It may be dead already, which is what matters here.
+        // It may have ended already, which is fine.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

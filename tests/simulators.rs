@@ -1,4 +1,5 @@
-//! The native simulator beside the Python one: the same numbers, bit for bit, and the same protocol.
+//! The native simulator compared with the Python one (bitwise equal numbers), and conformance
+//! tests.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -13,7 +14,7 @@ use serde_json::Value;
 use crate::harness::{installation, python, repository, rever, run, simulator, succeed, text};
 use crate::server::free_endpoint;
 
-/// Rows of the suite that a server with the defects must fail, and no others.
+/// The rules that a server with these defects must violate, and no others.
 const BROKEN: [(&str, &[&str]); 8] = [
     ("answers_older,never_ends,other_size", &["older", "horizon", "observation"]),
     ("repeats_twice", &["repeated", "close"]),
@@ -55,8 +56,8 @@ fn trace(program: &ServerProgram, arguments: &[&str]) -> Vec<Value> {
     said.lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect()
 }
 
-/// Joint positions, velocities, state, the expert's action, statistics and the image of every step of every task in
-/// every variant. Returns how many lines there were.
+/// Compares joint positions, velocities, state, the expert's action, statistics and the image of
+/// every step of every task in every variant. Returns the number of lines.
 fn assert_equal_traces(arguments: &[&str]) -> usize {
     let in_python = ServerProgram::Python(python().clone());
     let (expected, got) = (trace(&in_python, arguments), trace(native(), arguments));
@@ -95,9 +96,10 @@ fn every_layout_and_random_ones_are_equal_bit_for_bit() {
     }
 }
 
-/// A shape that leaves the picture is left out of drawing: at its edges too early or too late would be seen.
+/// Shapes outside the image are not rendered. A wrong test at the image's edges would change
+/// pixels.
 #[test]
-fn pictures_of_an_arm_that_sweeps_across_their_edges_are_equal_bit_for_bit() {
+fn images_of_an_arm_that_crosses_their_edges_are_equal_bit_for_bit() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("actions.txt");
     let to_the_left = "0 0.04 0 0 0 0 1\n".repeat(15);
@@ -109,7 +111,7 @@ fn pictures_of_an_arm_that_sweeps_across_their_edges_are_equal_bit_for_bit() {
     assert!(lines > 7 * 60, "expected a reset and an episode's steps of each, got {lines} lines");
 }
 
-/// A file of actions far from what the expert would do.
+/// A file of actions that differ strongly from the expert's.
 fn wild_actions(folder: &Path, count: usize) -> String {
     let file = folder.join("actions.txt");
     let mut actions = String::new();
@@ -128,7 +130,7 @@ fn wild_actions(folder: &Path, count: usize) -> String {
     file.to_str().expect("a readable path").to_owned()
 }
 
-/// What is written into tasks.toml in place of what, and the words of the errors of both programs.
+/// A replacement in tasks.toml, and the text of both programs' errors.
 const WRONG_TASKS: [(&str, &str, &str); 5] = [
     ("[tasks.widowx_spoon_on_towel.variants.paraphrase]", "hight = 1", "hight"),
     ("[tasks.widowx_spoon_on_towel.variants.paraphrase]", "random.speed = 1", "speed"),
@@ -138,7 +140,7 @@ const WRONG_TASKS: [(&str, &str, &str); 5] = [
 ];
 
 #[test]
-fn both_name_the_key_that_is_wrong_in_the_description_of_the_tasks() {
+fn both_programs_name_the_invalid_key_of_tasks_toml() {
     let ServerProgram::Native { program, assets, .. } = native() else {
         unreachable!("it is native")
     };
@@ -162,7 +164,7 @@ fn both_name_the_key_that_is_wrong_in_the_description_of_the_tasks() {
     }
 }
 
-/// The rows that failed, and how many passed.
+/// The violated rules, the number of passed rules, and the output.
 fn conformance(arguments: &[&str]) -> (BTreeSet<String>, usize, String) {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("rows.json");
@@ -186,7 +188,7 @@ fn our_servers_conform() {
         let (failed, passed, said) = conformance(&["--server", server]);
         assert!(failed.is_empty(), "{server}: {said}");
         assert_eq!(passed, said.lines().filter(|line| line.starts_with("pass ")).count());
-        // No number of a Bridge action is discrete.
+        // No dimension of a Bridge action is discrete.
         let skipped: Vec<&str> = said.lines().filter(|line| line.starts_with("skip ")).collect();
         assert!(matches!(skipped[..], [only] if only.contains(" discrete ")), "{server}: {said}");
     }
@@ -200,12 +202,12 @@ fn a_gymnasium_environment_conforms() {
     command.args(["-m", "rever_env", "serve", "--gymnasium", "CartPole-v1"]);
     let (failed, passed, said) = conformance_of(&mut command);
     assert!(failed.is_empty(), "{said}");
-    // Its action is discrete: no row has nothing to test.
+    // Its action is discrete, so no rule is skipped.
     assert!(said.contains(&format!("{passed} passed, 0 failed, 0 not tested")), "{said}");
 }
 
 #[test]
-fn a_task_that_no_policy_fits_is_refused_in_words() {
+fn a_task_with_another_action_length_is_refused_with_a_reason() {
     let mut command = python().command();
     command.args(["-m", "rever_env", "serve", "--gymnasium", "CartPole-v1"]);
     serving(&mut command, |endpoint| {
@@ -223,13 +225,13 @@ fn a_task_that_no_policy_fits_is_refused_in_words() {
         let output = run(evaluate.args(["--layouts", "random"]));
         let said = text(&output);
         assert_eq!(output.status.code(), Some(1), "{said}");
-        let words = "expected actions of 7 numbers, as the policy's are, got 1";
+        let words = "expected actions with 7 dimensions, as in the policy, got 1";
         assert!(said.contains("task CartPole-v1") && said.contains(words), "{said}");
     });
 }
 
 #[test]
-fn what_one_client_does_wrong_costs_the_others_of_the_native_server_nothing() {
+fn a_faulty_client_does_not_affect_others_of_the_native_server() {
     let mut pytest = python().command();
     pytest
         .current_dir(repository().join("env-server"))
@@ -240,14 +242,14 @@ fn what_one_client_does_wrong_costs_the_others_of_the_native_server_nothing() {
 }
 
 #[test]
-fn the_native_server_says_wrong_usage_in_a_line() {
+fn the_native_server_reports_wrong_usage_in_one_line() {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("there is a free port");
     let taken = listener.local_addr().expect("a bound listener has an address").to_string();
     let taken = format!("tcp/{taken}");
     let free = free_endpoint();
     for (arguments, status, words) in [
         (&[][..], 2, "--connect <ENDPOINT>|--listen <ENDPOINT>|--multicast"),
-        (&["--listen", &free, "--fleet", "../x"], 2, "cannot stand in a key"),
+        (&["--listen", &free, "--fleet", "../x"], 2, "invalid fleet name"),
         (&["--listen", &free, "--sessions", "0"], 2, "0 is not in 1..=256"),
         (
             &["--listen", &free, "--id-file", "/nowhere/id"],
@@ -263,12 +265,12 @@ fn the_native_server_says_wrong_usage_in_a_line() {
     }
 }
 
-/// Of a server that is started with this command and the options that a test needs.
+/// The conformance results of a server that is started with this command.
 fn conformance_of(command: &mut Command) -> (BTreeSet<String>, usize, String) {
     serving(command, |endpoint| conformance(&["--connect", endpoint]))
 }
 
-/// While a server runs that is started with this command.
+/// Runs `act` while a server runs that is started with this command.
 fn serving<T>(command: &mut Command, act: impl FnOnce(&str) -> T) -> T {
     let endpoint = free_endpoint();
     let mut server = command
@@ -286,8 +288,8 @@ fn serving<T>(command: &mut Command, act: impl FnOnce(&str) -> T) -> T {
 }
 
 #[test]
-fn a_broken_server_fails_every_row_that_it_should() {
-    // They wait more than they work.
+fn a_broken_server_violates_exactly_the_expected_rules() {
+    // These tests mostly wait, so they run in parallel.
     for some in BROKEN.chunks(BROKEN.len() / 2) {
         std::thread::scope(|scope| {
             for (defects, rows) in some {

@@ -6,23 +6,23 @@ use crate::harness::{repository, succeed};
 
 const FILE_LINES_MAX: usize = 400;
 const FUNCTION_LINES_MAX: usize = 70;
-/// Names that say nothing: whatever is in there belongs to the noun that it is about.
+/// Names without a meaning: the content of such a file belongs to the noun that it is about.
 const EMPTY_NAMES: [&str; 6] = ["utils", "util", "common", "helpers", "manager", "base"];
-/// Written so that this file does not break its own rule.
+/// Split, so that this file does not violate its own rule.
 const UNFINISHED: [&str; 3] = [concat!("TO", "DO"), concat!("FIX", "ME"), concat!("XX", "X")];
 
-/// One file under version control, or about to be.
+/// One file that is, or is about to be, under version control.
 pub struct SourceFile {
-    /// Relative to the repository, with `/`.
+    /// Path relative to the repository, with `/`.
     pub path: String,
     /// `None` for a binary file.
     pub text: Option<String>,
 }
 
-/// Every file that git knows or would add.
+/// Every file that git tracks or would add.
 pub fn source_files() -> Vec<SourceFile> {
     let mut list = std::process::Command::new("git");
-    // A container may run the tests as another user than the one who checked the files out.
+    // A container may run the tests as a user other than the owner of the files.
     list.args(["-c", "safe.directory=*", "ls-files", "-z", "--cached", "--others"]);
     let listed = succeed(list.arg("--exclude-standard").current_dir(repository()));
     let paths = listed.split('\0').filter(|path| repository().join(path).is_file());
@@ -52,7 +52,7 @@ fn every_file_is_tidy() {
 }
 
 #[test]
-fn each_rule_finds_its_offence() {
+fn each_rule_detects_its_violation() {
     let long = |count: usize, line: &str| format!("{line}\n").repeat(count);
     for (path, text, complaint) in [
         ("a.rs", "//! Says what it is for.\n".to_owned(), None),
@@ -114,7 +114,7 @@ fn complaints_about(path: &str, text: &str) -> Vec<String> {
     complaints
 }
 
-/// Formats without comments, and files that tools write, have nothing to begin with.
+/// Formats without comments and generated files have no first sentence.
 fn starts_with_a_sentence(path: &str, text: &str) -> bool {
     let first = text.lines().find(|line| !line.starts_with("#!")).unwrap_or_default();
     let name = path.rsplit('/').next().unwrap_or_default();
@@ -133,8 +133,8 @@ fn starts_with_a_sentence(path: &str, text: &str) -> bool {
     what.is_some_and(|what| name.ends_with(".html") || what.len() > 3)
 }
 
-/// The first line and the length of every function, found by indentation: both languages' formatters
-/// see to it that a body is indented more than its head and what follows.
+/// The first line and the length of every function, found by indentation: the formatters of both
+/// languages indent a body more than its head and the lines after it.
 fn functions(path: &str, text: &str) -> Vec<(usize, usize)> {
     let lines: Vec<&str> = text.lines().collect();
     let indent = |line: &str| line.len() - line.trim_start().len();
@@ -166,13 +166,13 @@ fn functions(path: &str, text: &str) -> Vec<(usize, usize)> {
     found
 }
 
-/// Cargo says nothing about a file that no `mod` names: it would never be compiled.
+/// Cargo ignores a file that no `mod` names: it would never be compiled.
 fn is_declared(path: &str, files: &[SourceFile]) -> bool {
     let (folder, name) = path.rsplit_once('/').unwrap_or(("", path));
     if ["lib.rs", "main.rs", "build.rs"].contains(&name) {
         return true;
     }
-    // The root of a crate of integration tests is found by cargo.
+    // Cargo finds the root file of integration tests by itself.
     if folder.ends_with("/tests") && !folder.contains("/src/") {
         return true;
     }

@@ -1,4 +1,4 @@
-//! The whole loop with the models that come with the program: four tasks, two strategies, real servers.
+//! The whole loop with the shipped models: four tasks, two strategies, real servers.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -12,8 +12,8 @@ use crate::evaluation::{Evaluation, WAIT, is_alive, kill};
 use crate::harness::{python, rever, run, succeed, text, wait_for};
 use crate::server::{Server, free_endpoint, open_router};
 
-/// One episode per task and strategy: the longest task lasts twice as long as the others, so that
-/// some episodes are recorded while others are still in the middle.
+/// One episode per task and strategy. The longest task takes twice as long as the others, so that
+/// some episodes are recorded while others are still running.
 const ARGUMENTS: [&str; 6] = [
     "--strategies=sample,verifier",
     "--candidates=3",
@@ -25,10 +25,11 @@ const ARGUMENTS: [&str; 6] = [
 /// SIMPLER's WidowX tasks, which our servers offer.
 const TASKS: usize = 4;
 const EPISODES: usize = TASKS * 2;
-/// The same of these episodes as computed by the program before the decider had a crate of its own (commit 091f8b1).
+/// The digest of these episodes as computed at commit 091f8b1, before the decider was a separate
+/// crate.
 const DIGEST: &str = "4e7a574af4e1588ace47dbf25ef943f96de6ab3ab99f82b140cbd02ed5681cad";
 
-/// A run that nothing disturbed, made once for all tests that compare with it.
+/// An undisturbed run, made once for all tests that compare with it.
 fn undisturbed() -> &'static (Evaluation, Value) {
     static RUN: OnceLock<(Evaluation, Value)> = OnceLock::new();
     RUN.get_or_init(|| {
@@ -38,7 +39,7 @@ fn undisturbed() -> &'static (Evaluation, Value) {
     })
 }
 
-/// Emptied at the start of the test and left for a look afterwards.
+/// A folder that is emptied at the start of the test and kept afterwards for inspection.
 fn fresh_folder(name: &str) -> std::path::PathBuf {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
     if folder.exists() {
@@ -71,7 +72,7 @@ fn every_episode_leaves_a_record_and_a_label() {
 }
 
 #[test]
-fn what_episodes_do_never_changes() {
+fn the_course_of_episodes_never_changes() {
     let (evaluation, _) = undisturbed();
     let said = succeed(rever().arg("digest").arg(evaluation.run_folder()));
     assert_eq!(said, format!("{DIGEST} {EPISODES} episodes\n"));
@@ -100,7 +101,7 @@ fn the_result_file_has_the_documented_shape() {
     let p50 = |time: &str| result[time]["p50"].as_f64().expect("a number");
     assert!(0.0 < p50("simulator_ms") && p50("simulator_ms") < p50("step_ms"), "{result}");
     let rows = result["rows"].as_array().expect("rows");
-    // One per task and one for all, for each strategy.
+    // For each strategy: one per task and one for all tasks.
     assert_eq!(rows.len(), (TASKS + 1) * 2);
     for row in rows {
         for key in ["task", "variant", "strategy"] {
@@ -124,7 +125,7 @@ fn the_result_file_has_the_documented_shape() {
 }
 
 #[test]
-fn a_killed_run_goes_on_where_it_was() {
+fn a_killed_run_is_resumed() {
     let (undisturbed, expected) = undisturbed();
     let evaluation = Evaluation::new(&fresh_folder("killed"), &ARGUMENTS);
     let mut running = evaluation.start();
@@ -151,7 +152,7 @@ fn episodes_of_a_killed_server_are_run_again_and_leave_one_label() {
     let evaluation =
         Evaluation::new(&fresh_folder("fault"), &[&ARGUMENTS[..], &["--servers=1"]].concat());
     let mut running = evaluation.start();
-    // The short episodes are recorded, so the long ones are in the middle.
+    // The short episodes are recorded, so the long ones are still running.
     evaluation.wait_for_records(&mut running, 1);
     let [server] = running.servers()[..] else { panic!("one server was asked for") };
     kill(server);
@@ -182,7 +183,7 @@ fn the_report_shows_every_episode() {
 }
 
 #[test]
-fn a_reader_that_has_seen_enough_is_no_defect() {
+fn a_reader_that_closes_the_pipe_is_no_error() {
     let (evaluation, _) = undisturbed();
     let out = fresh_folder("unread");
     let mut report = rever();
@@ -226,7 +227,7 @@ fn doctor_names_what_is_missing_and_fails() {
 }
 
 #[test]
-fn servers_elsewhere_are_reached_through_a_router() {
+fn servers_on_other_machines_are_reached_through_a_router() {
     let (undisturbed, _) = undisturbed();
     let endpoint = free_endpoint();
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
@@ -242,7 +243,7 @@ fn servers_elsewhere_are_reached_through_a_router() {
 }
 
 #[test]
-fn a_reset_that_breaks_is_repeated_and_a_server_of_other_tasks_is_left_alone() {
+fn a_failed_reset_is_repeated_and_a_server_without_the_task_is_not_used() {
     let endpoint = free_endpoint();
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     let router = runtime.block_on(open_router(&endpoint));
@@ -257,7 +258,7 @@ fn a_reset_that_breaks_is_repeated_and_a_server_of_other_tasks_is_left_alone() {
         "--layouts=random",
         "--seed=7",
         "--episodes=2",
-        // Nothing else goes on while the reset breaks.
+        // No other episode runs while the reset fails.
         "--sessions=1",
     ];
     let evaluation = Evaluation::new(&fresh_folder("mixed"), &arguments);
@@ -269,7 +270,7 @@ fn a_reset_that_breaks_is_repeated_and_a_server_of_other_tasks_is_left_alone() {
     runtime.block_on(async { router.close().await }).expect("the router closes");
 }
 
-/// Same candidates, same choices, same outcomes; names of the runs and times differ.
+/// Same candidates, choices and outcomes; run names and times differ.
 fn assert_same_episodes(ours: &Evaluation, theirs: &Evaluation) {
     let (ours, theirs) = (ours.records(), theirs.records());
     assert!(ours.keys().eq(theirs.keys()));
@@ -290,7 +291,7 @@ fn assert_same_episodes(ours: &Evaluation, theirs: &Evaluation) {
     }
 }
 
-/// The ids of all labels, each of which is there once.
+/// The ids of all labels; each one occurs once.
 fn labelled(evaluation: &Evaluation) -> BTreeSet<String> {
     let labels = store::labels::labels(&evaluation.labels()).expect("its labels");
     let ids: BTreeSet<String> = labels.iter().map(|label| label.id.clone()).collect();
@@ -298,7 +299,7 @@ fn labelled(evaluation: &Evaluation) -> BTreeSet<String> {
     ids
 }
 
-/// Episodes last as long as their task's horizon, success or not.
+/// An episode lasts as long as its task's horizon, with or without success.
 fn steps_max(task: &str) -> usize {
     if task == "widowx_put_eggplant_in_basket" { 120 } else { 60 }
 }

@@ -1,4 +1,4 @@
-//! The real client against real servers over zenoh, on good wires and bad ones.
+//! The real client and real servers over zenoh, on reliable and unreliable networks.
 
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use crate::harness::repository;
 use crate::relay::{Badness, Relay};
 use crate::server::{Server, free_endpoint, open_router};
 
-/// Longest wait for what takes a server a moment; a test machine may be busy.
+/// Maximum wait for an event that is nearly immediate on an idle machine.
 const WAIT: Duration = Duration::from_secs(60);
 
 fn open() -> Open {
@@ -40,7 +40,7 @@ async fn listen(fleet: &str) -> Network {
     Network::open(options).await.expect("the network opens")
 }
 
-/// A network that others can reach, and a server that has reached it.
+/// A network that others can reach, and a server connected to it.
 async fn network_with_server(fleet: &str, arguments: &[&str]) -> (Network, Server) {
     let network = listen(fleet).await;
     let server = Server::start(&network.listening()[0], fleet, arguments);
@@ -48,7 +48,7 @@ async fn network_with_server(fleet: &str, arguments: &[&str]) -> (Network, Serve
     (network, server)
 }
 
-/// A network that reaches the server beside the one that listens for it.
+/// A second network that is connected to the server.
 async fn connect(server: &Server, fleet: &str) -> Network {
     let connect = vec![server.endpoint.clone()];
     let options = NetworkOptions { connect, fleet: fleet.into(), ..NetworkOptions::default() };
@@ -68,7 +68,7 @@ async fn connect_through(endpoint: &str, timing: Timing) -> Network {
     network
 }
 
-/// A peer without any of our code.
+/// A peer that uses none of our code.
 async fn stranger_to(server: &Server) -> zenoh::Session {
     let mut configuration = zenoh::Config::default();
     let endpoints = format!("[\"{}\"]", server.endpoint);
@@ -82,7 +82,8 @@ async fn stranger_to(server: &Server) -> zenoh::Session {
     zenoh::open(configuration).await.expect("the stranger connects")
 }
 
-/// What two episodes with everything that an agent can ask bring: at resets and restores, and at steps.
+/// The replies of two episodes that use every request: those of resets and restores, and those of
+/// steps.
 type Trajectory = (Vec<Observation>, Vec<Transition>);
 
 async fn trajectory(network: &Network, server: &str) -> Result<Trajectory, EnvironmentFault> {
@@ -110,7 +111,7 @@ async fn trajectory(network: &Network, server: &str) -> Result<Trajectory, Envir
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bad_wire_ends_in_the_same_steps_as_a_good_one() {
+async fn an_unreliable_network_gives_the_same_steps_as_a_reliable_one() {
     let (network, server) = network_with_server("good", &[]).await;
     let clean = trajectory(&network, &server.id).await.expect("a good wire");
     drop(server);
@@ -143,7 +144,7 @@ async fn a_bad_wire_ends_in_the_same_steps_as_a_good_one() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_killed_server_is_a_fault_within_seconds_and_another_one_gives_the_same_steps() {
+async fn a_killed_server_is_detected_within_seconds_and_another_one_gives_the_same_steps() {
     let (network, mut first) = network_with_server("killed", &[]).await;
     let second = Server::start(&network.listening()[0], "killed", &[]);
     let whole = trajectory(&network, &first.id).await.expect("the first server lives");
@@ -171,7 +172,7 @@ async fn a_killed_server_is_a_fault_within_seconds_and_another_one_gives_the_sam
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_stuck_simulation_times_out_though_its_token_stands() {
+async fn a_stuck_simulation_times_out_although_its_token_exists() {
     let endpoint = free_endpoint();
     let relay =
         Relay::start(&endpoint, 1, Badness { dropped: 0, doubled: 0, delay_ms_max: 0 }).await;
@@ -190,7 +191,7 @@ async fn a_stuck_simulation_times_out_though_its_token_stands() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_link_that_comes_back_costs_no_episode() {
+async fn a_restored_link_affects_no_episode() {
     let endpoint = free_endpoint();
     let router = open_router(&endpoint).await;
     let server = Server::start_behind_router(&endpoint, "restarted", &[]);
@@ -207,7 +208,7 @@ async fn a_link_that_comes_back_costs_no_episode() {
     episode.step(&[0.0; 7]).await.expect("a step");
     router.close().await.expect("the router goes");
     let router = open_router(&endpoint).await;
-    let after = episode.step(&[0.0; 7]).await.expect("the same episode goes on");
+    let after = episode.step(&[0.0; 7]).await.expect("the same episode continues");
     let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
     let mut undisturbed = environment.reset(spoon()).await.expect("an episode");
     undisturbed.step(&[0.0; 7]).await.expect("a step");
@@ -217,7 +218,7 @@ async fn a_link_that_comes_back_costs_no_episode() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_link_to_a_listening_agent_that_stays_away_is_named() {
+async fn a_lost_link_to_a_listening_agent_is_reported() {
     let endpoint = free_endpoint();
     let options = NetworkOptions {
         listen: vec![endpoint.clone()],
@@ -244,7 +245,7 @@ async fn a_link_to_a_listening_agent_that_stays_away_is_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_session_dies_with_its_holder() {
+async fn a_session_ends_with_its_holder() {
     let (network, server) = network_with_server("holder", &["--sessions", "1"]).await;
     let holder = connect(&server, "holder").await;
     assert_eq!(holder.servers(1, WAIT).await.servers.len(), 1, "the server describes itself");
@@ -271,7 +272,7 @@ async fn a_session_dies_with_its_holder() {
     Environment::open(&network, &server.id, open()).await.expect("the session is free again");
 }
 
-/// Asks until the server has that many sessions in use; returns what it had last.
+/// Waits until the server has this number of sessions in use; returns the last number.
 async fn sessions_become(network: &Network, server: &str, expected: u32) -> u32 {
     let deadline = Instant::now() + WAIT;
     loop {
@@ -283,7 +284,7 @@ async fn sessions_become(network: &Network, server: &str, expected: u32) -> u32 
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn wrong_requests_are_refused_in_words_and_leave_the_world_as_it_was() {
+async fn invalid_requests_are_refused_with_a_reason_and_change_nothing() {
     let (network, server) = network_with_server("wrong", &[]).await;
     let check = |result: Result<(), EnvironmentFault>, words: &str| match result {
         Err(EnvironmentFault::Refused { reason }) => assert!(reason.contains(words), "{reason}"),
@@ -303,7 +304,7 @@ async fn wrong_requests_are_refused_in_words_and_leave_the_world_as_it_was() {
     );
     check(episode.restore(3).await, "slot: expected one of [], got 3");
     check(episode.save(16).await, "slot: expected 0 to 15, got 16");
-    let first = episode.step(&[0.0; 7]).await.expect("the episode goes on");
+    let first = episode.step(&[0.0; 7]).await.expect("the episode continues");
     let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
     let mut undisturbed = environment.reset(spoon()).await.expect("an episode");
     assert!(
@@ -313,7 +314,7 @@ async fn wrong_requests_are_refused_in_words_and_leave_the_world_as_it_was() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_no_client_of_ours_would_send_is_refused_in_words() {
+async fn malformed_requests_are_refused_with_a_reason() {
     let (network, server) = network_with_server("strange", &[]).await;
     let environment = Environment::open(&network, &server.id, open()).await.expect("a session");
     let session = environment.session().to_owned();

@@ -1,21 +1,22 @@
-//! The zenoh keys under `rever/3/{fleet}/`, built from names that are checked.
+//! The zenoh keys under `rever/3/{fleet}/`, built from validated names.
 
 use crate::PROTOCOL_VERSION;
 
-/// Longest name that may stand in a key.
+/// Maximum length of a name in a key.
 pub const KEY_NAME_BYTES_MAX: usize = 64;
 
-/// A name that cannot stand in a key.
+/// A name that is not valid in a key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{what} {name:?} cannot stand in a key: expected 1 to 64 of a-z A-Z 0-9 . _ -")]
+#[error("invalid {what} name {name:?}: expected 1 to 64 characters from a-z A-Z 0-9 . _ -")]
 pub struct KeyError {
-    /// Which name.
+    /// What the name is of, such as `fleet`.
     pub what: &'static str,
-    /// What came.
+    /// The invalid name.
     pub name: String,
 }
 
-/// All keys of one fleet: agents and servers meet only within the same one.
+/// All keys of one fleet. A fleet is a namespace: agents and servers see each other only within the
+/// same fleet.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Keys {
     prefix: String,
@@ -28,7 +29,7 @@ impl Keys {
         Ok(Self { prefix: format!("rever/{PROTOCOL_VERSION}/{fleet}") })
     }
 
-    /// Liveliness token of a server: it exists.
+    /// Liveliness token of a server: the server exists.
     pub fn server(&self, server: &str) -> Result<String, KeyError> {
         Ok(format!("{}/server/{}", self.prefix, checked("server", server)?))
     }
@@ -88,12 +89,12 @@ impl Keys {
         format!("{}/outcome/*", self.prefix)
     }
 
-    /// The server in a server's token or heartbeat key; none when the key is another one.
+    /// The server in the key of a server's token or heartbeat, `None` for any other key.
     pub fn server_of<'a>(&self, key: &'a str) -> Option<&'a str> {
         self.name_after("server", key)
     }
 
-    /// The session in a session's key; none when the key is another one.
+    /// The session in the key of a session, `None` for any other key.
     pub fn session_of<'a>(&self, key: &'a str) -> Option<&'a str> {
         self.name_after("session", key)
     }

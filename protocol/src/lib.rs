@@ -1,11 +1,12 @@
-//! What an agent and an environment server may say to each other: types, codec, keys; no input or output.
+//! The wire protocol between an agent and an environment server: types, codec, keys. No I/O.
 //!
-//! An agent reads a server's [`Description`], leases a session with [`Open`] and [`Opening`], and then
-//! sends one [`Request`] at a time and waits for its [`Reply`]. Beside that, servers beat
-//! ([`Heartbeat`]), agents publish what became of their episodes ([`EpisodeOutcome`]) and a trainer
+//! An agent reads a server's [`Description`], leases a session with [`Open`] and [`Opening`], and
+//! then sends one [`Request`] at a time and waits for its [`Reply`]. In addition, servers send
+//! [`Heartbeat`]s, agents publish the outcome of each episode ([`EpisodeOutcome`]), and a trainer
 //! publishes verifiers ([`VerifierUpdate`]). Each message is one MessagePack body on one zenoh key.
 //!
-//! These types are the specification; `golden/` holds their bytes, and README.md says the rest.
+//! These types are the specification. `golden/` holds their encodings; README.md explains the rules
+//! between messages.
 
 pub mod codec;
 pub mod keys;
@@ -17,5 +18,5 @@ pub use codec::{CodecError, Message, decode, encode};
 pub use keys::{KeyError, Keys};
 pub use message::*;
 
-/// Version of everything in this crate; peers of another version are refused in words.
+/// Version of the protocol. A peer of another version is refused with a reason.
 pub const PROTOCOL_VERSION: u32 = 3;

@@ -1,46 +1,50 @@
-//! Every limit of the protocol; a message beyond one of them is refused, most of them before it is decoded.
+//! All limits of the protocol. A message beyond a limit is refused, in most cases before it is
+//! decoded.
 
-/// Bytes of a [`crate::Request`]; the longest valid one is far below.
+/// Size of a [`crate::Request`] in bytes; the longest valid request is far smaller.
 pub const REQUEST_BYTES_MAX: usize = 1024;
-/// Bytes of a [`crate::Reply`]: the largest image and everything beside it.
+/// Size of a [`crate::Reply`] in bytes: the largest image and all other fields.
 pub const REPLY_BYTES_MAX: usize = 4 << 20;
-/// Bytes of an [`crate::Open`].
+/// Size of an [`crate::Open`] in bytes.
 pub const OPEN_BYTES_MAX: usize = 1024;
-/// Bytes of an [`crate::Opening`].
+/// Size of an [`crate::Opening`] in bytes.
 pub const OPENING_BYTES_MAX: usize = 4096;
-/// Bytes of a [`crate::Description`].
+/// Size of a [`crate::Description`] in bytes.
 pub const DESCRIPTION_BYTES_MAX: usize = 256 << 10;
-/// Bytes of a [`crate::Heartbeat`].
+/// Size of a [`crate::Heartbeat`] in bytes.
 pub const HEARTBEAT_BYTES_MAX: usize = 512;
-/// Bytes of an [`crate::EpisodeOutcome`].
+/// Size of an [`crate::EpisodeOutcome`] in bytes.
 pub const OUTCOME_BYTES_MAX: usize = 4096;
-/// Bytes of a [`crate::VerifierUpdate`]: two hidden layers on a 4096-wide state in 32 bits fit.
+/// Size of a [`crate::VerifierUpdate`] in bytes: enough for two hidden layers on a 4096-dimensional
+/// state in 32 bits.
 pub const VERIFIER_UPDATE_BYTES_MAX: usize = 64 << 20;
 
-/// The largest of the above: what a transport must be willing to carry.
+/// The largest of these sizes: the transport must accept it.
 pub const MESSAGE_BYTES_MAX: usize = VERIFIER_UPDATE_BYTES_MAX;
 
-/// Bytes of a name: task, variant, run, strategy, holder, server, session, digest.
+/// Length of a name in bytes: task, variant, run, strategy, holder, server, session, digest.
 pub const NAME_BYTES_MAX: usize = 128;
-/// Bytes of a text: instruction, reason, simulator.
+/// Length of a text in bytes: instruction, reason, simulator.
 pub const TEXT_BYTES_MAX: usize = 1024;
-/// Height and width of an image in pixels.
+/// Height and width of an image, in pixels.
 pub const IMAGE_SIDE_MAX: usize = 1024;
-/// Height and width of the tiles in which a step's image may come, in pixels.
+/// Height and width of a tile, in pixels. A step's image may be sent as the tiles that changed.
 pub const TILE_SIDE: usize = 16;
-/// Maps and arrays inside one another.
+/// Nesting depth of maps and arrays.
 pub const DEPTH_MAX: usize = 8;
-/// Elements of an array or a map.
+/// Elements in an array or a map.
 pub const ELEMENTS_MAX: usize = 4096;
 /// Save slots of a session, numbered from 0.
 pub const SLOTS_MAX: u32 = 16;
-/// Sessions one server process may offer.
+/// Sessions that one server process may offer.
 pub const SESSIONS_MAX: u32 = 256;
-/// First seed that is too large: seeds fit a double, so that every language can hold them.
+/// Exclusive upper bound of a seed: every seed is exact as a double, so that every language can
+/// hold it.
 pub const SEED_END: u64 = 1 << 53;
-/// Numbers of an action: a `Step` with so many is within its limit.
+/// Dimensions of an action; a `Step` of this length is within its size limit.
 pub const ACTION_DIMENSIONS_MAX: usize = 128;
-/// Numbers of a state.
+/// Dimensions of a state.
 pub const STATE_DIMENSIONS_MAX: usize = ELEMENTS_MAX;
-/// Bytes of a body that a server takes off the network: what is beyond its own limit and below this is refused in words.
+/// Size up to which a server receives a body at all, in bytes. A body between a message's own limit
+/// and this one is refused with a reason; a larger one is dropped.
 pub const SERVER_MESSAGE_BYTES_MAX: usize = 1 << 20;

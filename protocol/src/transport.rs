@@ -1,14 +1,15 @@
-//! How both sides configure zenoh: this machine and nothing else unless told otherwise, and the limits on messages.
+//! The zenoh configuration of both sides: local to this machine unless configured otherwise, with
+//! limits on messages.
 
 use std::fmt::Display;
 
-/// A slow reader holds a message up that long before the link is given up.
+/// How long a slow reader may block a message before its link is closed.
 const CONGESTION_MICROSECONDS: u64 = 60_000_000;
-/// What zenoh adds to a body.
+/// Upper bound of what zenoh adds to a body.
 const ENVELOPE_BYTES: usize = 65_536;
 
-/// Entries of zenoh's configuration as key and JSON value. `client_wait_ms`: how long a client waits for the router or
-/// server that it is told to connect to. `message_bytes_max`: larger bodies are dropped as they arrive.
+/// Entries of zenoh's configuration as key and JSON value. `client_wait_ms` is how long a client
+/// waits for its router or server. Bodies larger than `message_bytes_max` are dropped on arrival.
 pub fn settings(
     connect: &[String],
     listen: &[String],
@@ -16,8 +17,9 @@ pub fn settings(
     client_wait_ms: u32,
     message_bytes_max: usize,
 ) -> Vec<(&'static str, String)> {
-    // A router forwards between its clients, not between its peers, which it takes for linked. And
-    // a program with one way out and no way in needs no more than a client does.
+    // A router forwards between clients but not between peers, because it assumes that peers are
+    // linked to each other. A program with one endpoint to connect to and none to listen on is
+    // therefore a client.
     let is_client = connect.len() == 1 && listen.is_empty() && !multicast;
     let mut entries = vec![
         ("mode", if is_client { "\"client\"" } else { "\"peer\"" }.to_owned()),
@@ -33,18 +35,20 @@ pub fn settings(
             CONGESTION_MICROSECONDS.to_string(),
         ),
     ];
-    // Left out, this is a free port on every interface: what others find by multicast.
+    // Without this entry zenoh listens on a free port of every interface, which peers find by
+    // multicast.
     if !listen.is_empty() || !multicast {
         entries.push(("listen/endpoints", json(listen)));
     }
     entries
 }
 
-/// What zenoh says of an error, without the places in its sources: they are paths of the machine that built the program.
+/// zenoh's error message without source locations, which are paths on the machine that built the
+/// program.
 pub fn in_words(error: impl Display) -> String {
     let text = error.to_string();
     let (mut words, mut rest) = (String::new(), text.as_str());
-    // ERROR at FILE.rs:LINE. - Caused by ...
+    // Form of a message: ERROR at FILE.rs:LINE. - Caused by ...
     while let Some((before, after)) = rest.split_once(".rs:") {
         let line_end = after.find(|next: char| !next.is_ascii_digit()).unwrap_or(after.len());
         let start = before.rfind(" at ").unwrap_or(before.len());

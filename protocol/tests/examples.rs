@@ -1,4 +1,5 @@
-//! One example of each message; the values are exact in 32 bits, so that both languages write the same numbers.
+//! One example of each message. The values are exact in 32 bits, so that both languages encode the
+//! same numbers.
 
 use protocol::{
     Description, Dimension, EpisodeOutcome, FaultKind, Heartbeat, Image, Observation, Open,
@@ -112,7 +113,7 @@ pub fn requests() -> [(&'static str, Request); 6] {
     ]
 }
 
-/// A step of whose three tiles the middle one has changed.
+/// A step that changed the second of three tiles.
 fn tiles() -> Reply {
     let pixels = (0..768).map(|index| (index % 251) as u8).collect();
     let image = Image { height: 16, width: 48, pixels };

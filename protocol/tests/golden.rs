@@ -1,4 +1,4 @@
-//! Each example's bytes are those in `golden/`, and read back as the example.
+//! The encoding of each example equals its golden file and decodes to the example.
 
 use std::collections::BTreeSet;
 use std::fmt::Debug;
@@ -12,7 +12,7 @@ pub fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("golden")
 }
 
-/// The explicit switch: without it nothing is written.
+/// The tests write files only with this explicit switch.
 pub fn updating() -> bool {
     std::env::var_os("REVER_UPDATE_GOLDEN").is_some_and(|value| value == "1")
 }
@@ -31,7 +31,7 @@ fn check<M: Message + Debug + PartialEq>(name: &str, message: &M) -> String {
     }
     let mut longer = golden;
     longer.push(0xc0);
-    assert!(decode::<M>(&longer).is_err(), "{name}: accepted a byte behind it");
+    assert!(decode::<M>(&longer).is_err(), "{name}: accepted an extra byte");
     file.file_name().expect("a file").to_string_lossy().into_owned()
 }
 

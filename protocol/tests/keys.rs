@@ -1,4 +1,4 @@
-//! Zenoh keys and the names that may stand in them.
+//! Zenoh keys and the names in them.
 
 use protocol::Keys;
 
@@ -36,10 +36,7 @@ fn names_are_found_in_keys() {
 fn a_name_with_wildcards_or_slashes_is_refused() {
     for name in ["", "*", "**", "a/b", "a b", "$*", "a?b", "a#b", "ä", &"a".repeat(65)] {
         let error = Keys::new(name).expect_err(name);
-        assert!(
-            error.to_string().contains("cannot stand in a key: expected 1 to 64 of"),
-            "{error}"
-        );
+        assert!(error.to_string().contains("expected 1 to 64 characters from"), "{error}");
     }
     assert!(Keys::new(&"a".repeat(64)).is_ok());
 }

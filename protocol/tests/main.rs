@@ -1,18 +1,19 @@
-//! The protocol's tests; run with `REVER_UPDATE_GOLDEN=1` they rewrite `golden/`, which the Python tests read too.
+//! Tests of the protocol. With `REVER_UPDATE_GOLDEN=1` they rewrite `golden/`, which the Python
+//! tests read too.
 
 /// One example of each message, the same as in the Python tests.
 mod examples;
-/// Each example's bytes are those in `golden/`, and read back as the example.
+/// The encoding of each example equals its golden file and decodes to the example.
 mod golden;
-/// Zenoh keys and the names that may stand in them.
+/// Zenoh keys and the names in them.
 mod keys;
-/// Bytes that no encoder of ours writes and every decoder must read.
+/// Encodings that our encoder does not produce and that every decoder must accept.
 mod other_forms;
-/// The README says what the types say.
+/// The README agrees with the types.
 mod readme;
-/// Bytes that must be refused, and the words for it.
+/// Encodings that must be refused, with the expected reasons.
 mod refused;
-/// Pictures as the tiles that changed.
+/// Images as changed tiles.
 mod tiles;
-/// What zenoh's errors say once the places in its source are taken out.
+/// zenoh's errors without the source locations.
 mod transport;

@@ -1,4 +1,5 @@
-//! Bytes that no encoder of ours writes and every decoder must read; `golden/other_forms/` keeps them for the Python tests.
+//! Encodings that our encoder does not produce and that every decoder must accept.
+//! `golden/other_forms/` holds them for the Python tests.
 
 use std::fmt::Debug;
 
@@ -8,7 +9,7 @@ use serde_json::{Map, Value, json};
 use crate::refused::{changed, float, save, step, stepped};
 use crate::{examples, golden};
 
-/// Each with the example that it is another form of.
+/// Each encoding with the name of the example that it represents.
 fn forms() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let action = [0.015625, -0.0078125, 0.0, 0.0, 0.0, 0.25, -1.0].map(float).concat();
     let pixels = examples::observation().image.pixels;

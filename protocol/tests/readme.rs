@@ -1,4 +1,4 @@
-//! The specification in README.md is held to the types: fields and their kinds, limits, keys.
+//! Compares the specification in README.md with the types: fields and their kinds, limits, keys.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -10,7 +10,7 @@ use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 
 use crate::examples;
 
-/// The shape of a message's bytes, fields in their order.
+/// The structure of an encoded message, with its fields in order.
 #[derive(Debug, Clone, PartialEq)]
 enum Shape {
     Fields(Vec<(String, Shape)>),
@@ -63,7 +63,7 @@ impl<'de> Deserialize<'de> for Shape {
     }
 }
 
-/// What the README says of each type: its fields and their kinds.
+/// For each type in the README: its fields and their kinds.
 type Types = BTreeMap<String, Vec<(String, String)>>;
 
 fn readme() -> String {
@@ -91,10 +91,10 @@ fn types(readme: &str) -> Types {
     types
 }
 
-/// Holds a message's bytes to the README's types; notes which of them were met.
+/// Compares an encoded message with the README's types, and adds the types that occur to `met`.
 fn compare(types: &Types, name: &str, shape: &Shape, met: &mut Vec<String>) {
     let Shape::Fields(fields) = shape else { panic!("{name}: expected fields, got {shape:?}") };
-    let said = types.get(name).unwrap_or_else(|| panic!("the README does not say what {name} is"));
+    let said = types.get(name).unwrap_or_else(|| panic!("the README does not describe {name}"));
     let names = |fields: Vec<&String>| fields.into_iter().cloned().collect::<Vec<_>>();
     let (expected, got) = (
         names(fields.iter().map(|(field, _)| field).collect()),
@@ -153,7 +153,7 @@ fn the_readme_names_every_field_of_every_message() {
         whole(&format!("{of}::{variant}"), fields.clone());
     }
     let unknown: Vec<&String> = types.keys().filter(|name| !met.contains(name)).collect();
-    assert!(unknown.is_empty(), "the README names what is no message: {unknown:?}");
+    assert!(unknown.is_empty(), "the README describes types that no message contains: {unknown:?}");
 }
 
 #[test]

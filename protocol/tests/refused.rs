@@ -1,11 +1,13 @@
-//! Bytes that must be refused, and the words for it; `golden/refused/` keeps them for the Python tests.
+//! Encodings that must be refused, with the expected reasons. `golden/refused/` holds them for the
+//! Python tests.
 
 use protocol::{Description, Message, Open, PROTOCOL_VERSION, Reply, Request, decode, encode};
 use serde_json::{Map, Value, json};
 
 use crate::{examples, golden, tiles};
 
-/// A message that must be refused: its name, its type, its bytes, and the words that the refusal must contain.
+/// A message that must be refused: its name, its type, its bytes, and a text that the refusal must
+/// contain.
 pub struct Case {
     name: &'static str,
     message: &'static str,
@@ -19,8 +21,10 @@ pub fn case(name: &'static str, message: &'static str, bytes: Vec<u8>, words: &s
 
 /// The bytes of an example with its first `from` replaced by `to`.
 pub fn changed(mut bytes: Vec<u8>, from: &[u8], to: &[u8]) -> Vec<u8> {
-    let start =
-        bytes.windows(from.len()).position(|window| window == from).expect("it is in there");
+    let start = bytes
+        .windows(from.len())
+        .position(|window| window == from)
+        .expect("the example contains it");
     bytes.splice(start..start + from.len(), to.iter().copied());
     bytes
 }
@@ -309,7 +313,7 @@ fn refusal(case: &Case) -> String {
 }
 
 #[test]
-fn malformed_bytes_are_refused_in_words() {
+fn malformed_bytes_are_refused_with_a_reason() {
     for case in cases() {
         let refusal = refusal(&case);
         assert!(

@@ -1,16 +1,16 @@
-//! A picture's way as tiles: what changed, and nothing else.
+//! Images sent as changed tiles.
 
 use protocol::{Image, encode};
 
 use crate::examples;
 use crate::refused::{Case, case, changed};
 
-/// Every byte another one than its neighbours.
+/// An image in which every byte differs from its neighbours.
 fn image(height: usize, width: usize) -> Image {
     Image { height, width, pixels: (0..height * width * 3).map(|at| (at % 251) as u8).collect() }
 }
 
-/// Other values at these bytes.
+/// The image with other values at these offsets.
 fn with(image: &Image, places: &[usize]) -> Image {
     let mut pixels = image.pixels.to_vec();
     for &place in places {
@@ -28,9 +28,10 @@ fn sent(last: &Image, next: &Image) -> (Vec<u32>, usize, Image) {
 }
 
 #[test]
-fn changed_tiles_make_the_picture_whole_again() {
+fn changed_tiles_restore_the_complete_image() {
     let last = image(32, 48);
-    // Rows of 144 bytes, of which a tile has 48: the corners of the tile in the middle above, and the last byte.
+    // A row has 144 bytes, 48 of them per tile. Changed are the corners of the middle tile of the
+    // upper row, and the last byte of the image.
     let corners = [48, 95, 15 * 144 + 48, 15 * 144 + 95, 32 * 144 - 1];
     let next = with(&last, &corners);
     assert_eq!(sent(&last, &next), (vec![1, 5], 2 * 768, next.clone()));
@@ -43,7 +44,7 @@ fn changed_tiles_make_the_picture_whole_again() {
 }
 
 #[test]
-fn a_picture_that_others_hold_stays_as_it_is() {
+fn an_image_that_is_shared_is_not_modified() {
     let last = image(32, 48);
     let next = with(&last, &[100]);
     let (tiles, pixels) = next.changes(&last).expect("one tile is new");
@@ -59,23 +60,23 @@ fn a_picture_that_others_hold_stays_as_it_is() {
 }
 
 #[test]
-fn a_picture_is_whole_where_tiles_would_not_do() {
+fn an_image_is_sent_whole_if_tiles_cannot_represent_it() {
     let last = image(32, 48);
     assert_eq!(with(&last, &[0, 48, 96]).changes(&last).map(|(tiles, _)| tiles.len()), Some(3));
     assert_eq!(with(&last, &[0, 48, 96, 4607]).changes(&last), None, "more than half is new");
     assert_eq!(image(48, 32).changes(&last), None, "another size");
     assert_eq!(image(15, 48).changes(&image(15, 48)), None, "a side is cut");
-    assert_eq!(image(0, 0).changes(&image(0, 0)), None, "no picture");
+    assert_eq!(image(0, 0).changes(&image(0, 0)), None, "no image");
 }
 
 #[test]
-fn tiles_of_another_picture_are_refused() {
+fn tiles_of_an_image_of_another_size_are_refused() {
     let error = image(32, 48).complete(&[], image(48, 32));
     let words = "changed_tiles: expected an image of 48 x 32 pixels as before, got 32 x 48";
     assert_eq!(error, Err(words.to_owned()));
 }
 
-/// What must be refused.
+/// Encodings that must be refused.
 pub fn cases() -> Vec<Case> {
     let stepped = || encode(&examples::replies()[7].1).expect("examples are valid");
     let numbered = |numbers: &[u8]| {

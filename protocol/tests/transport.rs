@@ -1,4 +1,4 @@
-//! What zenoh's errors say once the places in its source are taken out.
+//! zenoh's errors without the source locations.
 
 use protocol::transport::in_words;
 

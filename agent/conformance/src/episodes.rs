@@ -1,4 +1,4 @@
-//! Episodes: what may come when, the same reset gives the same bytes, save and restore, the horizon.
+//! Tests of episodes: order of requests, determinism, save and restore, the horizon.
 
 use std::time::Instant;
 
@@ -8,7 +8,7 @@ use protocol::{Observation, Open, Reply, Request, TaskDescription, Transition, d
 use super::subject::{Subject, Talk, names};
 use super::{Table, Tested};
 
-/// Steps that are compared.
+/// Number of steps that are compared.
 const STEPS: usize = 6;
 
 pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
@@ -26,21 +26,21 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row(
             "observation",
-            "an observation has the image that was asked for, the state described, no expert's action",
+            "an observation has the requested image, the described state and no expert action",
             observation(subject),
         )
         .await;
     table
         .row(
             "reset_task",
-            "a Reset to a task, a variant or a layout that is not offered is refused",
+            "a Reset to an unknown task, variant or layout is refused",
             reset_task(subject),
         )
         .await;
     table
         .row(
             "tasks",
-            "every task in every variant can be reset, with the instruction and the state described",
+            "every task in every variant can be reset and has the described instruction and state",
             tasks(subject),
         )
         .await;
@@ -54,21 +54,21 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row(
             "simulator_time",
-            "a step says what the simulator took for it, which is less than its round trip",
+            "simulator_us of a step is positive and at most its round-trip time",
             simulator_time(subject),
         )
         .await;
-    table.row("seeds", "another seed gives another layout", seeds(subject)).await;
+    table.row("seeds", "different seeds give different layouts", seeds(subject)).await;
     table
         .row("save", "Save and Restore are bit-exact; Reset empties the slots", save(subject))
         .await;
     table
-        .row("concurrent", "sessions at once do not change one another", concurrent(subject))
+        .row("concurrent", "concurrent sessions do not affect each other", concurrent(subject))
         .await;
     table
         .row(
             "horizon",
-            "the last step is truncated, and a step beyond is refused",
+            "the last step is truncated, and a further step is refused",
             horizon(subject),
         )
         .await;
@@ -79,7 +79,7 @@ async fn seeds(subject: &Subject<'_>) -> Result<Tested> {
     let first = talk.reset(0).await?;
     let second = talk.reset(1).await?;
     talk.close().await?;
-    ensure!(first != second, "expected another observation with another seed");
+    ensure!(first != second, "expected different observations with different seeds");
     Ok(Tested::Kept)
 }
 
@@ -94,20 +94,20 @@ async fn observation(subject: &Subject<'_>) -> Result<Tested> {
         "expected an image of {height} x {width}, got {rows} x {columns}"
     );
     as_described(subject.task(), &seen)?;
-    ensure!(seen.expert_action.is_none(), "expected no expert's action, got one");
+    ensure!(seen.expert_action.is_none(), "expected no expert action, got one");
     talk.close().await?;
     Ok(Tested::Kept)
 }
 
 async fn tasks(subject: &Subject<'_>) -> Result<Tested> {
-    // Without images, which some servers are slow to set up.
+    // Without images, because some servers need a long time to set up rendering.
     let open = Open { image_height: 0, image_width: 0, ..subject.open() };
     let mut talk = subject.talk_with(&open).await?;
     for task in &subject.description.tasks {
         talk.task = task.clone();
         let seen = talk.reset(0).await;
         seen.and_then(|seen| as_described(task, &seen))
-            .with_context(|| format!("task {} in its variant {}", task.task, task.variant))?;
+            .with_context(|| format!("task {}, variant {}", task.task, task.variant))?;
     }
     talk.close().await?;
     Ok(Tested::Kept)
@@ -116,7 +116,7 @@ async fn tasks(subject: &Subject<'_>) -> Result<Tested> {
 fn as_described(task: &TaskDescription, seen: &Observation) -> Result<()> {
     ensure!(
         seen.state.len() == task.state.len(),
-        "expected a state of {} numbers, as described, got {}",
+        "expected a state with {} dimensions, as in the description, got {}",
         task.state.len(),
         seen.state.len()
     );
@@ -144,10 +144,10 @@ async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
     let beyond = own.layouts;
     let request = talk.resetting(Some(beyond), 0);
     names(&talk.refused(request).await?, &["layout", &beyond.to_string()])?;
-    // Refused: the world is unchanged, and the episode goes on.
+    // After a refusal the environment is unchanged and the episode continues.
     talk.hold_still().await?;
     talk.save(0).await?;
-    // Both steps follow a Restore: whether that is exact is another row's question.
+    // Both steps follow a Restore, because its exactness is tested by another rule.
     talk.restore(0).await?;
     let expected = stepped(talk.go().await?);
     talk.restore(0).await?;
@@ -167,7 +167,7 @@ async fn reset_task(subject: &Subject<'_>) -> Result<Tested> {
     Ok(Tested::Kept)
 }
 
-/// Replies to a Reset and some steps, as if each were the first.
+/// The replies to a Reset and some steps, all with number 1.
 async fn trajectory(talk: &mut Talk, index: u64) -> Result<Vec<Reply>> {
     let mut replies = vec![Reply::Observed { sequence: 1, observation: talk.reset(index).await? }];
     for _ in 0..STEPS {
@@ -176,7 +176,7 @@ async fn trajectory(talk: &mut Talk, index: u64) -> Result<Vec<Reply>> {
     Ok(replies)
 }
 
-/// How it came and how long it took are no part of what happened.
+/// Encoding and duration of a step do not matter for the comparison.
 fn stepped(transition: Transition) -> Reply {
     Reply::Stepped { sequence: 1, transition, changed_tiles: None, simulator_us: 0 }
 }
@@ -185,12 +185,12 @@ fn equal(expected: &[Reply], got: &[Reply]) -> Result<()> {
     let differs = expected.iter().zip(got).position(|(expected, got)| expected != got);
     if let Some(step) = differs {
         let what = difference(&expected[step], &got[step]);
-        bail!("expected the same replies, got another {what} at step {step}");
+        bail!("expected equal replies, got a different {what} at step {step}");
     }
     Ok(())
 }
 
-/// What two replies to the same request do not have in common.
+/// The first part in which two replies to the same request differ.
 fn difference(expected: &Reply, got: &Reply) -> &'static str {
     let parts = |reply: &Reply| match reply {
         Reply::Observed { observation, .. } => Some((observation.clone(), None)),
@@ -237,12 +237,15 @@ async fn simulator_time(subject: &Subject<'_>) -> Result<Tested> {
         };
         ensure!(
             u128::from(simulator_us) <= round_trip_us,
-            "expected a simulator_us up to the round trip's {round_trip_us}, got {simulator_us}"
+            "expected simulator_us of at most the round-trip time {round_trip_us}, got {simulator_us}"
         );
         said_us += u64::from(simulator_us);
     }
     talk.close().await?;
-    ensure!(said_us > 0, "expected a simulator_us above 0 in one of {STEPS} steps, got none");
+    ensure!(
+        said_us > 0,
+        "expected simulator_us above 0 in at least one of {STEPS} steps, got 0 in all"
+    );
     Ok(Tested::Kept)
 }
 
@@ -255,7 +258,7 @@ async fn save(subject: &Subject<'_>) -> Result<Tested> {
         first.push(stepped(talk.go().await?));
     }
     let restored = talk.restore(2).await?;
-    ensure!(restored == saved.observation, "expected the observation that was saved");
+    ensure!(restored == saved.observation, "expected the saved observation, got a different one");
     let mut again = Vec::new();
     for _ in 0..STEPS {
         again.push(stepped(talk.go().await?));
@@ -270,7 +273,7 @@ async fn save(subject: &Subject<'_>) -> Result<Tested> {
 async fn concurrent(subject: &Subject<'_>) -> Result<Tested> {
     let now = subject.network.describe(&subject.description.server).await?;
     if now.sessions_max - now.sessions < 2 {
-        return Ok(Tested::NotTested("it has less than two free sessions".to_owned()));
+        return Ok(Tested::NotTested("the server has fewer than two free sessions".to_owned()));
     }
     let mut alone = subject.talk().await?;
     let expected = [trajectory(&mut alone, 0).await?, trajectory(&mut alone, 1).await?];
@@ -288,14 +291,14 @@ async fn horizon(subject: &Subject<'_>) -> Result<Tested> {
     const STEPS_MAX: u32 = 1_000;
     let steps_max = subject.task().steps_max;
     if steps_max > STEPS_MAX {
-        return Ok(Tested::NotTested(format!("its horizon is {steps_max} steps")));
+        return Ok(Tested::NotTested(format!("the horizon of {steps_max} steps is too long")));
     }
     let mut talk = subject.episode(0).await?;
     for step in 1..=steps_max {
         let transition = talk.hold_still().await?;
         ensure!(
             transition.truncated == (step == steps_max) || transition.terminated,
-            "expected truncated at step {steps_max} alone, got {} at step {step}",
+            "expected truncated only at step {steps_max}, got {} at step {step}",
             transition.truncated
         );
         if transition.terminated {

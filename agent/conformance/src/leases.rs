@@ -1,4 +1,4 @@
-//! Leases: how sessions end.
+//! Tests of leases: how sessions end.
 
 use std::time::Duration;
 
@@ -9,16 +9,16 @@ use super::subject::Subject;
 use super::{Table, Tested};
 use runtime::wire::Probe;
 
-/// A session without its holder lives this long.
+/// How long a session lives without its holder.
 const HOLDER_WAIT: Duration = Duration::from_secs(10);
-/// Servers look at their leases now and then.
+/// Margin for servers that check their leases periodically.
 const LATE_MAX: Duration = Duration::from_secs(3);
 
 pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
     table
         .row(
             "close",
-            "Close is answered again for its last reply may be lost; nothing follows it",
+            "a repeated Close is answered again, because its reply may be lost; later requests are refused",
             async {
                 let mut talk = subject.episode(0).await?;
                 talk.close().await?;
@@ -41,14 +41,14 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
                 ended(&mut talk.probe, HOLDER_WAIT + LATE_MAX).await?;
                 ensure!(
                     sessions(subject).await? <= before,
-                    "expected its session to be free again"
+                    "expected the session to be free again"
                 );
                 Ok(Tested::Kept)
             },
         )
         .await;
     table
-        .row("holder_missing", "a session that nobody holds within 10 s ends", async {
+        .row("holder_missing", "a session without a holder's token within 10 s ends", async {
             let server = &subject.description.server;
             let mut probe = Probe::open(subject.network, server, &subject.open()).await?;
             ended(&mut probe, HOLDER_WAIT + LATE_MAX).await?;
@@ -57,14 +57,18 @@ pub async fn test(subject: &Subject<'_>, table: &mut Table<'_>) {
         .await;
 }
 
-/// Waits until the server says that the session has ended.
+/// Waits for the server's message that the session has ended.
 async fn ended(probe: &mut Probe, wait: Duration) -> Result<()> {
     match probe.receive(wait).await {
-        None => bail!("expected Refused number 0 within {wait:?}, got nothing"),
+        None => bail!("expected Refused with number 0 within {wait:?}, got no reply"),
         Some(bytes) => match decode(&bytes)? {
             Reply::Refused { sequence: 0, .. } => Ok(()),
             other => {
-                bail!("expected Refused number 0, got {} number {}", other.kind(), other.sequence())
+                bail!(
+                    "expected Refused with number 0, got {} with number {}",
+                    other.kind(),
+                    other.sequence()
+                )
             }
         },
     }

@@ -1,6 +1,8 @@
-//! Tests any server against the protocol's specification, over the wire, as an agent in another language would meet it.
+//! Tests any server against the protocol specification over the network, without assumptions about
+//! its implementation.
 //!
-//! Rows are independent: each opens sessions of its own, and a server that fails one goes on to the next.
+//! The rules are tested independently: each test opens its own sessions, and a failure does not
+//! stop the following tests.
 
 mod episodes;
 mod handshake;
@@ -16,41 +18,41 @@ use serde::Serialize;
 use self::subject::Subject;
 use runtime::wire::Network;
 
-/// A server that an endpoint leads to is seen within this time.
+/// Discovery timeout of the server.
 const SERVER_WAIT: Duration = Duration::from_secs(30);
 
-/// One rule of the specification and whether the server keeps it.
+/// One rule of the specification and the result of its test.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
-    /// Short, for scripts.
+    /// A short name for scripts.
     pub name: &'static str,
-    /// What the specification says.
+    /// The rule of the specification.
     pub rule: &'static str,
-    /// What came of it.
+    /// The result of the test.
     pub verdict: Verdict,
-    /// What was expected and what came, or why it was not tested.
+    /// What was expected and what was received, or why the rule was not tested.
     pub reason: Option<String>,
 }
 
-/// What came of a row.
+/// The result of a test.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Verdict {
-    /// The rule is kept.
+    /// The server follows the rule.
     Pass,
-    /// It is not.
+    /// The server violates the rule.
     Fail,
-    /// It could not be tested on this server.
+    /// The rule cannot be tested on this server.
     Skip,
 }
 
-/// What a single test came to, when it did not break.
+/// The result of a test that did not fail.
 enum Tested {
     Kept,
     NotTested(String),
 }
 
-/// All rows, and whoever wants to see them as they come.
+/// All results, and a callback that receives each result at once.
 struct Table<'a> {
     subject: &'a Subject<'a>,
     rows: Vec<Row>,
@@ -58,7 +60,7 @@ struct Table<'a> {
 }
 
 impl Table<'_> {
-    /// Tests one rule; an error is its failure.
+    /// Tests one rule; an error means that the server violates it.
     async fn row(
         &mut self,
         name: &'static str,
@@ -66,7 +68,7 @@ impl Table<'_> {
         test: impl Future<Output = Result<Tested>>,
     ) {
         let result = test.await;
-        // What the test left open must not fail the next one.
+        // Sessions left open by this test must not affect the next one.
         self.subject.settle().await;
         let (verdict, reason) = match result {
             Ok(Tested::Kept) => (Verdict::Pass, None),
@@ -79,7 +81,7 @@ impl Table<'_> {
     }
 }
 
-/// Tests `server`, or the first one that is seen. `report` gets each row when it is done.
+/// Tests `server`, or the first server found. `report` receives each result as soon as it is known.
 pub async fn test(
     network: &Network,
     server: Option<&str>,
@@ -91,7 +93,7 @@ pub async fn test(
     let description = descriptions.find(|description| wanted(&description.server));
     let description = description.with_context(|| {
         let reasons =
-            found.undescribed.iter().map(|(id, reason)| format!("; server {id} {reason}"));
+            found.undescribed.iter().map(|(id, reason)| format!("; server {id}: {reason}"));
         let reasons: String = reasons.collect();
         format!("no environment server found: check --connect and --fleet{reasons}")
     })?;

@@ -1,4 +1,4 @@
-//! The server under test, and a conversation with one of its sessions.
+//! The server under test and its sessions.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
@@ -14,42 +14,44 @@ use tokio::time::Instant;
 
 use runtime::wire::{Network, Probe};
 
-/// Seeds from here on are for tuning: what a test sees of an environment is in no evaluation.
+/// Tests use seeds from here on, in the tuning range, so that nothing they show is part of an
+/// evaluation.
 const FIRST_SEED: u64 = 2_000_000_000;
 
-/// A reply takes no longer, resets included.
+/// Maximum time for a reply, including resets.
 const REPLY_WAIT: Duration = Duration::from_secs(30);
-/// A server that answers what it should drop does so within this time.
+/// How long to wait for a reply that must not be sent.
 pub const SILENCE: Duration = Duration::from_secs(1);
-/// How long sessions of a failed test may take to end, and how often that is looked at.
+/// Maximum time for sessions of a failed test to end, and the interval of checking.
 const SETTLE_WAIT_MAX: Duration = Duration::from_secs(13);
 const SETTLE_LOOK: Duration = Duration::from_millis(50);
-/// Of the images that are asked for: small, so that the tests are quick, and of enough tiles that most stay as they are.
+/// Side of the requested images: small, so that the tests are fast, with enough tiles for most of
+/// them to stay unchanged.
 const SIDE: u32 = 96;
-/// How far a dimension is moved, as a share of its range; without bounds, in its own unit.
+/// How far a dimension is moved: share of its range, or in its own unit without bounds.
 const SHARE: f32 = 0.02;
 
 /// The server under test.
 pub struct Subject<'a> {
     pub network: &'a Network,
     pub description: Description,
-    /// Sessions in use when nothing of the test is.
+    /// Number of sessions in use without those of the current test.
     settled: AtomicU32,
 }
 
-/// A session whose requests are numbered as they should be.
+/// A session with correctly numbered requests.
 pub struct Talk {
     pub probe: Probe,
-    /// What `reset` and `resetting` ask for.
+    /// The task of `reset` and `resetting`.
     pub task: TaskDescription,
     still: Vec<f32>,
     moving: Vec<f32>,
-    /// Of the last request.
+    /// Number of the last request.
     pub sequence: u64,
-    /// The last request as it was sent, and its reply as it came.
+    /// The encodings of the last request and of its reply.
     pub request: Vec<u8>,
     pub reply: Vec<u8>,
-    /// Of the last observation: what a step's tiles are laid on.
+    /// Image of the last observation, which a step's tiles are applied to.
     image: Option<Image>,
 }
 
@@ -57,14 +59,14 @@ impl<'a> Subject<'a> {
     pub fn new(network: &'a Network, description: Description) -> Result<Subject<'a>> {
         ensure!(
             !description.tasks.is_empty(),
-            "server {} offers no tasks: there is nothing to test",
+            "server {}: expected at least one task to test, got none",
             description.server
         );
         let settled = AtomicU32::new(description.sessions);
         Ok(Subject { network, description, settled })
     }
 
-    /// Waits for the end of sessions that nobody holds any more.
+    /// Waits for the end of sessions that have no holder any more.
     pub async fn settle(&self) {
         let mut looks = tokio::time::interval(SETTLE_LOOK);
         let deadline = Instant::now() + SETTLE_WAIT_MAX;
@@ -76,28 +78,28 @@ impl<'a> Subject<'a> {
                 return;
             }
         }
-        // A server that keeps sessions is not waited for again after every row.
+        // A server that does not end its sessions is waited for only once.
         if let Ok(now) = self.network.describe(&self.description.server).await {
             self.settled.store(now.sessions, Ordering::Relaxed);
         }
     }
 
-    /// The task that sessions are opened for.
+    /// The task for which sessions are opened.
     pub fn task(&self) -> &TaskDescription {
         &self.description.tasks[0]
     }
 
-    /// An image's side as the server allows it, which may have no images.
+    /// An image side within the server's limit, which is 0 without images.
     pub fn side(&self, wanted: u32) -> u32 {
         wanted.min(self.description.image_side_max)
     }
 
-    /// An action that does little.
+    /// An action with little effect.
     pub fn still(&self) -> Vec<f32> {
         self.task().action.iter().map(rest).collect()
     }
 
-    /// An action that does something.
+    /// An action with a visible effect.
     pub fn moving(&self) -> Vec<f32> {
         let moved = |dimension: &Dimension| {
             let rest = rest(dimension);
@@ -122,7 +124,7 @@ impl<'a> Subject<'a> {
         }
     }
 
-    /// A session that is held.
+    /// A session with a holder.
     pub async fn talk(&self) -> Result<Talk> {
         self.talk_with(&self.open()).await
     }
@@ -142,7 +144,7 @@ impl<'a> Subject<'a> {
         })
     }
 
-    /// A session with an episode begun.
+    /// A session with a running episode.
     pub async fn episode(&self, index: u64) -> Result<Talk> {
         let mut talk = self.talk().await?;
         talk.reset(index).await?;
@@ -160,7 +162,7 @@ impl Talk {
         let mut reply: Reply = decode(&self.reply)?;
         ensure!(
             reply.sequence() == sequence,
-            "expected a reply number {sequence}, got {} number {}",
+            "expected a reply with number {sequence}, got {} with number {}",
             reply.kind(),
             reply.sequence()
         );
@@ -168,7 +170,7 @@ impl Talk {
         Ok(reply)
     }
 
-    /// Completes the reply's image, if it has one, and keeps it.
+    /// Completes the reply's image, if it has one, and stores it.
     fn look(&mut self, reply: &mut Reply) -> Result<()> {
         let image = match reply {
             Reply::Observed { observation, .. } | Reply::Restored { observation, .. } => {
@@ -177,7 +179,10 @@ impl Talk {
             Reply::Stepped { transition, changed_tiles, .. } => {
                 let image = &mut transition.observation.image;
                 if let Some(tiles) = changed_tiles.take() {
-                    let last = self.image.take().context("expected a whole image first")?;
+                    let last = self
+                        .image
+                        .take()
+                        .context("expected a complete image before changed tiles")?;
                     image.complete(&tiles, last).map_err(anyhow::Error::msg)?;
                 }
                 image
@@ -188,7 +193,7 @@ impl Talk {
         Ok(())
     }
 
-    /// Sends any bytes and returns what comes back.
+    /// Sends arbitrary bytes and returns the reply.
     pub async fn answer_to(&mut self, bytes: &[u8]) -> Result<Vec<u8>> {
         self.probe.send(bytes).await?;
         let reply = self.probe.receive(REPLY_WAIT).await;
@@ -203,7 +208,7 @@ impl Talk {
         match decode(&bytes)? {
             Reply::Refused { sequence: got, reason } if got == sequence => Ok(reason),
             other => Err(anyhow!(
-                "expected Refused number {sequence}, got {} number {}",
+                "expected Refused with number {sequence}, got {} with number {}",
                 other.kind(),
                 other.sequence()
             )),
@@ -218,7 +223,7 @@ impl Talk {
         }
     }
 
-    /// Begins an episode on a random layout.
+    /// Starts an episode with a random layout.
     pub async fn reset(&mut self, index: u64) -> Result<Observation> {
         let request = self.resetting(None, FIRST_SEED + index);
         match self.ask(request).await? {
@@ -233,12 +238,12 @@ impl Talk {
         move |sequence| Request::Reset { sequence, task, variant, layout, seed }
     }
 
-    /// Steps with an action that does little.
+    /// Steps with an action that has little effect.
     pub async fn hold_still(&mut self) -> Result<Transition> {
         self.step(self.still.clone()).await
     }
 
-    /// Steps with an action that does something.
+    /// Steps with an action that has a visible effect.
     pub async fn go(&mut self) -> Result<Transition> {
         self.step(self.moving.clone()).await
     }
@@ -272,7 +277,7 @@ impl Talk {
     }
 }
 
-/// Zero, or the nearest to it that the dimension has.
+/// Zero, or the nearest valid value of the dimension.
 fn rest(dimension: &Dimension) -> f32 {
     0.0f32.max(dimension.low.unwrap_or(f32::MIN)).min(dimension.high.unwrap_or(f32::MAX))
 }
@@ -284,15 +289,15 @@ fn words(reply: &Reply) -> &str {
     }
 }
 
-/// The bytes of a message that our own codec would not send.
+/// The encoding of a message that our own encoder would refuse.
 pub fn unchecked(message: &impl Serialize) -> Vec<u8> {
     rmp_serde::to_vec_named(message).expect("a message can be written")
 }
 
-/// Fails unless a reason names what it is about.
+/// Fails unless a reason contains all parts.
 pub fn names(reason: &str, parts: &[impl AsRef<str>]) -> Result<()> {
     for part in parts.iter().map(AsRef::as_ref) {
-        ensure!(reason.contains(part), "expected a reason that names {part:?}, got {reason:?}");
+        ensure!(reason.contains(part), "expected a reason that contains {part:?}, got {reason:?}");
     }
     Ok(())
 }

@@ -1,17 +1,19 @@
-//! Actions: what a robot does in one control step, or in several.
+//! Actions of one or several control steps.
 
 use anyhow::{Result, ensure};
 use protocol::Dimension;
 use serde::{Deserialize, Serialize};
 
-/// The numbers of one control step, as the task's description says. Of a Bridge task: translation in metres, rotation
-/// vector in radians, gripper +1 open or -1 closed; base frame.
+/// The action of one control step, with the dimensions in the task's description. For a Bridge
+/// task: translation in metres, rotation vector in radians, gripper +1 open or -1 closed, in the
+/// base frame.
 pub type Action = Vec<f32>;
 
-/// The name of the dimension that opens and closes a gripper.
+/// Name of the dimension that opens and closes a gripper.
 const GRIPPER: &str = "gripper";
 
-/// The actions of one decision, executed one control step after the other. Never empty; all of one length.
+/// The actions of one decision, executed in consecutive control steps. Never empty; all have the
+/// same length.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<Action>", into = "Vec<Action>")]
 pub struct ActionChunk {
@@ -19,12 +21,15 @@ pub struct ActionChunk {
 }
 
 impl ActionChunk {
-    /// Refuses an empty chunk, actions of several lengths and numbers that are not finite.
+    /// Refuses an empty chunk, actions of different lengths and numbers that are not finite.
     pub fn new(actions: Vec<Action>) -> Result<ActionChunk> {
         let length = actions.first().map_or(0, Vec::len);
         ensure!(length > 0, "action chunk: expected at least one action of at least one number");
         if let Some(other) = actions.iter().find(|action| action.len() != length) {
-            anyhow::bail!("action chunk: expected {length} numbers each, got {}", other.len());
+            anyhow::bail!(
+                "action chunk: expected {length} numbers in every action, got {}",
+                other.len()
+            );
         }
         ensure!(
             actions.iter().flatten().all(|number| number.is_finite()),
@@ -53,7 +58,7 @@ impl ActionChunk {
         self.actions
     }
 
-    /// Numbers of each action.
+    /// Number of dimensions of each action.
     pub fn action_length(&self) -> usize {
         self.actions[0].len()
     }
@@ -73,23 +78,23 @@ impl From<ActionChunk> for Vec<Action> {
     }
 }
 
-/// How the numbers of a policy's actions compare with each other.
+/// The dimensions of a policy's actions, and how to compare two actions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ActionSpace {
-    /// One unit of each number: of a checkpoint its q99 - q01, and 2 for the gripper. A number with unit 0 has no range
-    /// and tells no candidates apart.
+    /// The unit of each dimension: q99 - q01 of the checkpoint's statistics, and 2 for the gripper.
+    /// A dimension with unit 0 has no range and is ignored in comparisons.
     pub scale: Vec<f32>,
-    /// Which number is the gripper, of which only the sign counts.
+    /// Index of the gripper dimension, of which only the sign is compared.
     pub gripper: Option<usize>,
 }
 
 impl ActionSpace {
-    /// Numbers of an action.
+    /// Number of dimensions of an action.
     pub fn length(&self) -> usize {
         self.scale.len()
     }
 
-    /// The action that holds a robot still at the start of an episode: no motion, an open gripper.
+    /// The action that keeps a robot still at the start of an episode: no motion, gripper open.
     pub fn hold_still(dimensions: &[Dimension]) -> Action {
         dimensions.iter().map(|one| if one.name == GRIPPER { 1.0 } else { 0.0 }).collect()
     }
@@ -106,7 +111,7 @@ mod tests {
         for (actions, expected) in [
             (vec![], "at least one action"),
             (vec![vec![]], "at least one action"),
-            (vec![vec![0.5], vec![0.5, 1.0]], "expected 1 numbers each, got 2"),
+            (vec![vec![0.5], vec![0.5, 1.0]], "expected 1 numbers in every action, got 2"),
             (vec![vec![f32::NAN]], "expected finite numbers"),
         ] {
             let error = ActionChunk::new(actions).expect_err(expected).to_string();

@@ -1,47 +1,50 @@
-//! What a policy proposes: sampled candidates, each with reasoning and action, or malformed.
+//! The candidates that a policy proposes, each with reasoning and action, or malformed.
 
 use protocol::message::Image;
 
 use crate::{ActionChunk, Malformed, Reasoning};
 
-/// One decision to be made.
+/// The input of one decision.
 #[derive(Clone, Copy)]
 pub struct ProposalRequest<'a> {
-    /// Of the policy's size.
+    /// The camera image, in the policy's size.
     pub image: &'a Image,
-    /// What the robot feels, as the task's description says.
+    /// The robot's state, with the dimensions in the task's description.
     pub state: &'a [f32],
-    /// What the robot is told to do, in any case of letters.
+    /// The language instruction for the robot; letter case does not matter.
     pub instruction: &'a str,
-    /// How many candidates to sample; at least one.
+    /// Number of candidates to sample; at least one.
     pub candidates: usize,
-    /// 0 takes the likeliest token each time.
+    /// Sampling temperature; 0 is greedy decoding.
     pub temperature: f32,
-    /// Candidate i draws from a stream of its own, derived from this seed and i.
+    /// Candidate i is sampled from its own random stream, derived from this seed and i.
     pub seed: u64,
 }
 
 /// The candidates of one decision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Proposal {
-    /// In the order of their streams.
+    /// In the order of their random streams.
     pub candidates: Vec<Candidate>,
 }
 
 /// One sampled candidate.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
-    /// From the first token after the prompt to the last action token, without `</s>`; empty where a policy tells none.
+    /// All tokens from the first one after the prompt to the last action token, without `</s>`.
+    /// Empty if the policy does not expose tokens.
     pub tokens: Vec<u32>,
-    /// Of all tokens and of `</s>`, at temperature 1 whatever the temperature was.
+    /// Log-probability of all tokens and of `</s>` at temperature 1, independent of the sampling
+    /// temperature.
     pub log_probability: f32,
-    /// Of each token, at temperature 1.
+    /// Log-probability of each token at temperature 1.
     pub log_probabilities: Vec<f32>,
-    /// Log-probability, in nats, of each part of the reasoning and of each number of the action.
+    /// Log-probability in nats of each section of the reasoning and of each dimension of the
+    /// action.
     pub confidence: Vec<f32>,
-    /// The last token's hidden state after the final norm; empty where a policy tells none.
+    /// Hidden state of the last token after the final norm; empty if the policy does not expose it.
     pub hidden: Vec<f32>,
-    /// What the tokens mean, or why they mean nothing.
+    /// The parsed reasoning and action, or the reason why parsing failed.
     pub parsed: Result<Parsed, Malformed>,
 }
 
@@ -50,13 +53,14 @@ pub struct Candidate {
 pub struct Parsed {
     /// Empty for a policy that acts without reasoning.
     pub reasoning: Reasoning,
-    /// Token ids of the action bins as sampled, neighbouring ids for neighbouring bins; empty where there are none.
+    /// Token ids of the sampled action bins; neighbouring bins have neighbouring ids. Empty if the
+    /// policy has no action tokens.
     pub action_tokens: Vec<u32>,
-    /// What to do.
+    /// The actions to execute.
     pub actions: ActionChunk,
 }
 
-/// What a well-formed candidate would do: the only part of it that agreement and the oracle look at.
+/// The action of a well-formed candidate: the only part that agreement and the oracle compare.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CandidateAction<'a> {
     /// As [`Parsed::action_tokens`].
@@ -66,7 +70,7 @@ pub struct CandidateAction<'a> {
 }
 
 impl Candidate {
-    /// What it would do; none when it is malformed.
+    /// The action, or `None` if the candidate is malformed.
     pub fn action(&self) -> Option<CandidateAction<'_>> {
         let parsed = self.parsed.as_ref().ok()?;
         Some(CandidateAction { tokens: &parsed.action_tokens, actions: &parsed.actions })

@@ -1,4 +1,4 @@
-//! What is remembered of an episode from one decision to the next.
+//! The state of an episode that persists between decisions.
 
 use std::sync::Arc;
 
@@ -7,27 +7,27 @@ use sha2::{Digest, Sha256};
 
 use crate::{Action, ActionSpace, ObjectTracker, Scorer, Setting};
 
-/// The memory of one episode, and how it is decided.
+/// The setting and the state of one episode.
 #[derive(Clone)]
 pub struct EpisodeContext {
-    /// How candidates are drawn and chosen.
+    /// How candidates are sampled and selected.
     pub setting: Setting,
-    /// What the robot is told to do.
+    /// The language instruction for the robot.
     pub instruction: String,
-    /// The same from the first step to the last, whatever is published meanwhile.
+    /// The scorer of the whole episode, even if a new verifier is published meanwhile.
     pub scorer: Option<Arc<dyn Scorer>>,
-    /// The policy's seed, the same for every strategy.
+    /// Seed of the policy's sampling, the same for every strategy.
     pub sampling_seed: u64,
-    /// Control steps so far.
+    /// Number of control steps so far.
     pub step: u32,
-    /// Where the reasoning so far sees the objects.
+    /// Object positions according to the reasoning so far.
     pub tracker: ObjectTracker,
-    /// Holds the robot still: no motion, and the gripper as it was told last.
+    /// The action that keeps the robot still: no motion, with the last gripper command.
     hold_still: Action,
 }
 
 impl EpisodeContext {
-    /// Of an episode that begins now; `action` are the numbers of the task's actions.
+    /// The context at the start of an episode; `action` is the task's action space.
     pub fn new(
         setting: Setting,
         sampling_seed: u64,
@@ -46,17 +46,17 @@ impl EpisodeContext {
         }
     }
 
-    /// The policy's seed at this control step.
+    /// Seed of the policy's sampling at this control step.
     pub fn seed(&self) -> u64 {
         step_seed(self.sampling_seed, self.step)
     }
 
-    /// What to do where no candidate is well formed.
+    /// The action to execute if no candidate is well formed.
     pub fn hold_still(&self) -> &[f32] {
         &self.hold_still
     }
 
-    /// Takes note of actions that are executed.
+    /// Updates the context with executed actions.
     pub(crate) fn note(&mut self, actions: &[Action], space: &ActionSpace) {
         self.step += actions.len() as u32;
         let last = actions.last().zip(space.gripper);
@@ -69,7 +69,7 @@ impl EpisodeContext {
     }
 }
 
-/// The policy's seed at one control step: every step draws from its own stream.
+/// Seed of the policy's sampling at one control step: every step uses its own random stream.
 pub fn step_seed(sampling_seed: u64, step: u32) -> u64 {
     let digest = Sha256::new()
         .chain_update(sampling_seed.to_le_bytes())
@@ -85,10 +85,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_step_of_every_episode_has_a_seed_of_its_own() {
+    fn every_step_of_every_episode_has_its_own_seed() {
         assert_ne!(step_seed(1, 0), step_seed(1, 1));
         assert_ne!(step_seed(1, 0), step_seed(2, 0));
-        // Computed independently: the first eight bytes, little endian, of
+        // Computed independently: the first eight bytes in little-endian order of
         // `sha256(bytes.fromhex("0100000000000000" "00000000"))`.
         assert_eq!(step_seed(1, 0), SEED_OF_ONE);
     }

@@ -1,4 +1,4 @@
-//! The decision of one control step for a batch of episodes: propose, score, choose.
+//! The decisions of one control step for a batch of episodes: propose, score, choose.
 
 use std::sync::Arc;
 
@@ -9,45 +9,47 @@ use crate::{
     ProposalRequest, ReasoningFeatures, Scorer, ScoringRequest, TrackedObjects,
 };
 
-/// Makes the decisions of episodes with one policy. Has no state: an episode's memory is its [`EpisodeContext`].
+/// Makes decisions with one policy. It has no state: the state of an episode is its
+/// [`EpisodeContext`].
 pub struct Decider {
     policy: Arc<dyn Policy>,
 }
 
-/// One episode that waits for a decision.
+/// An episode that waits for a decision.
 pub struct DecisionRequest<'a> {
-    /// What is seen now.
+    /// The current observation.
     pub observation: &'a Observation,
-    /// What the episode remembers. After a fault it must not be used again.
+    /// The episode's state. After a fault it must not be used again.
     pub context: &'a mut EpisodeContext,
 }
 
-/// What was decided.
+/// The result of a decision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decision {
-    /// All that were sampled.
+    /// All sampled candidates.
     pub candidates: Vec<Candidate>,
-    /// The scorer's logit of each, where there is a scorer.
+    /// The scorer's logit of each candidate, if there is a scorer.
     pub logits: Option<Vec<f32>>,
-    /// The executed one; none when no candidate is well formed and the robot holds still.
+    /// Index of the executed candidate; `None` if no candidate is well formed and the robot holds
+    /// still.
     pub chosen: Option<usize>,
-    /// What to do, in this control step and those after it.
+    /// The actions to execute in this and the following control steps.
     pub actions: ActionChunk,
 }
 
-/// Why there is no decision: a fault of the episode, never an outcome.
+/// Why there is no decision. This is a fault of the episode, never an outcome.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum DecisionFault {
-    /// The policy failed on this request alone.
+    /// The policy failed for this request.
     #[error("policy: {reason}")]
     Policy {
-        /// What was expected and what came.
+        /// What was expected and what was received.
         reason: String,
     },
     /// The scorer failed.
     #[error("scorer: {reason}")]
     Scorer {
-        /// What was expected and what came.
+        /// What was expected and what was received.
         reason: String,
     },
 }
@@ -65,17 +67,18 @@ impl DecisionFault {
 type Scored = Result<(Proposal, Option<Vec<f32>>), DecisionFault>;
 
 impl Decider {
-    /// A decider that asks `policy`.
+    /// A decider that uses `policy`.
     pub fn new(policy: Arc<dyn Policy>) -> Decider {
         Decider { policy }
     }
 
-    /// The policy that it asks.
+    /// The policy of this decider.
     pub fn policy(&self) -> &Arc<dyn Policy> {
         &self.policy
     }
 
-    /// Decides for every request, in their order. What a request gets does not depend on those beside it.
+    /// Decides for all requests and returns the decisions in their order. A decision does not
+    /// depend on the other requests of the batch.
     pub async fn decide(
         &self,
         mut requests: Vec<DecisionRequest<'_>>,
@@ -89,8 +92,8 @@ impl Decider {
             .collect()
     }
 
-    /// Proposals of all requests together; where that fails, of each alone, so that a request which the policy cannot
-    /// answer costs no other its decision.
+    /// Proposes candidates for all requests in one batch. If the batch fails, proposes for each
+    /// request alone, so that one failing request does not affect the others.
     async fn propose(
         &self,
         requests: &[DecisionRequest<'_>],
@@ -112,7 +115,7 @@ impl Decider {
         }
     }
 
-    /// As many proposals as requests, each with at least one candidate.
+    /// Checks that there is one proposal per request, each with the requested number of candidates.
     async fn proposals(&self, asked: &[ProposalRequest<'_>]) -> anyhow::Result<Vec<Proposal>> {
         let proposals = self.policy.propose(asked).await?;
         anyhow::ensure!(
@@ -128,7 +131,8 @@ impl Decider {
         Ok(proposals)
     }
 
-    /// Scores every proposal whose episode has a scorer; requests of one scorer are scored together.
+    /// Scores every proposal of an episode that has a scorer. Requests with the same scorer are
+    /// scored in one batch.
     async fn score(
         &self,
         requests: &mut [DecisionRequest<'_>],
@@ -211,7 +215,7 @@ fn proposal_request<'a>(request: &'a DecisionRequest<'_>) -> ProposalRequest<'a>
     }
 }
 
-/// Takes in what the candidates say about the scene.
+/// Updates the object tracker with the candidates' reasoning.
 fn track(context: &mut EpisodeContext, proposal: &Proposal) -> TrackedObjects {
     let parsed = proposal.candidates.iter().filter_map(|candidate| candidate.parsed.as_ref().ok());
     let said: Vec<ReasoningFeatures> =
@@ -219,7 +223,7 @@ fn track(context: &mut EpisodeContext, proposal: &Proposal) -> TrackedObjects {
     context.tracker.note(&said)
 }
 
-/// The scorers of the requests that have a proposal, each with the numbers of its requests.
+/// The scorers of the requests that have a proposal, each with the indices of its requests.
 fn by_scorer(
     requests: &[DecisionRequest<'_>],
     proposals: &[Result<Proposal, DecisionFault>],
@@ -237,7 +241,7 @@ fn by_scorer(
     groups
 }
 
-/// One finite logit for every well-formed candidate.
+/// Checks that every well-formed candidate has one finite logit.
 fn check(logits: Vec<f32>, candidates: &[Candidate]) -> anyhow::Result<Vec<f32>> {
     let (expected, got) = (candidates.len(), logits.len());
     anyhow::ensure!(got == expected, "expected {expected} scores, got {got}");

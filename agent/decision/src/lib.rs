@@ -1,30 +1,30 @@
-//! What one control step is made of, without a network, a disk or a clock.
+//! One control step, without network, disk or clock.
 //!
 //! ```text
 //! Observation ─▶ Policy::propose ─▶ Candidates ─▶ Scorer::score ─▶ Strategy::choose ─▶ ActionChunk
 //!                └────────────────────────── Decider::decide ──────────────────────────┘
 //! ```
 //!
-//! [`Decider`] makes these calls for a batch of episodes, each with an [`EpisodeContext`] of its own. Rollouts, the
-//! benchmark and the tests all use it. A failure of the policy or of a scorer is a fault of the episode that it
-//! happened in, never an outcome.
+//! [`Decider`] makes these calls for a batch of episodes, each with its own [`EpisodeContext`].
+//! Rollouts, the benchmark and the tests use it. A failure of the policy or of a scorer is a fault
+//! of the episode in which it occurred, never an outcome.
 
-// What is seen and done.
+// Tasks and actions.
 mod action;
 mod task;
 
-// What a policy proposes.
+// Proposals of a policy.
 mod candidate;
 mod policy;
 mod reasoning;
 
-// How one candidate is chosen.
+// Choosing one candidate.
 mod scorer;
 mod setting;
 mod strategy;
 mod tracker;
 
-// All of it together.
+// The complete decision.
 mod context;
 mod decider;
 

@@ -1,31 +1,34 @@
-//! The seam for policies: a local checkpoint, a policy server, a script.
+//! The interface of policies: a local checkpoint, a policy server, a script.
 
 use anyhow::Result;
 use async_trait::async_trait;
 
 use crate::{ActionSpace, Proposal, ProposalRequest};
 
-/// What others need to know of a policy.
+/// What other components need to know about a policy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PolicyInfo {
-    /// What it computes, in hexadecimal: policies with one digest give the same candidates.
+    /// Identity of the computation, in hexadecimal: policies with the same digest give the same
+    /// candidates.
     pub digest: String,
-    /// Height and width of the images that it wants.
+    /// Height and width of the images that the policy expects.
     pub image_size: (usize, usize),
-    /// The numbers of its actions.
+    /// The policy's action space.
     pub action_space: ActionSpace,
-    /// Length of a candidate's hidden state; none where the policy tells none.
+    /// Length of a candidate's hidden state; `None` if the policy does not expose it.
     pub hidden_size: Option<usize>,
-    /// Calls of [`Policy::propose`] that it computes side by side; 1 where a larger batch costs hardly more than a small one.
+    /// How many calls of [`Policy::propose`] are computed in parallel; 1 if a large batch takes
+    /// hardly longer than a small one.
     pub parallel_calls: usize,
 }
 
-/// Proposes candidates. What a request gets must not depend on the requests beside it.
+/// Proposes candidates. The proposal for a request must not depend on the other requests of the
+/// batch.
 #[async_trait]
 pub trait Policy: Send + Sync {
-    /// Of this policy.
+    /// Information about this policy.
     fn info(&self) -> &PolicyInfo;
 
-    /// Samples the candidates of every request, one proposal for each, in their order.
+    /// Samples candidates for all requests; returns one proposal per request, in the same order.
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>>;
 }

@@ -1,8 +1,9 @@
-//! The chain of thought as data: ECoT's tags in order, each exactly once, parsed strictly.
+//! The chain of thought as data. The parser is strict: each of ECoT's tags must occur exactly once
+//! and in order.
 
 use std::fmt;
 
-/// ECoT's tags in order. `ACTION:` ends the text; what follows it are action tokens.
+/// ECoT's tags in order. `ACTION:` ends the text; action tokens follow it.
 pub const TAGS: [&str; 9] = [
     "TASK:",
     "PLAN:",
@@ -15,48 +16,50 @@ pub const TAGS: [&str; 9] = [
     "ACTION:",
 ];
 
-/// Largest coordinate in the square of 256 pixels; ECoT's boxes may end at its border.
+/// Largest coordinate in the image of 256 x 256 pixels; ECoT's boxes may end at its border.
 const COORDINATE_MAX: u16 = 256;
 
-/// What the policy thought before it acted.
+/// The reasoning of a policy before its action.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Reasoning {
-    /// The whole task in words.
+    /// The whole task as text.
     pub task: String,
-    /// The steps to it.
+    /// The steps of the plan.
     pub plan: String,
-    /// Objects in sight; for the shipped model always what is moved, then where to.
+    /// Visible objects. The shipped model always names the object to move first and its destination
+    /// second.
     pub visible_objects: Vec<VisibleObject>,
     /// Why this step of the plan is the current one.
     pub subtask_reasoning: String,
     /// The current step of the plan.
     pub subtask: String,
-    /// Why the robot moves as it does.
+    /// Why the robot makes this movement.
     pub move_reasoning: String,
     /// The text of `MOVE:`, which is a keyword here.
     pub movement: String,
-    /// Pixels (x, y) in the square of 256: where the gripper is, and in ECoT where it will be.
+    /// Pixel coordinates (x, y) in an image of 256 x 256 pixels: the gripper's position and, in
+    /// ECoT, its future positions.
     pub gripper_position: Vec<[u16; 2]>,
 }
 
-/// An object and its box in the square of 256 pixels.
+/// An object and its bounding box in an image of 256 x 256 pixels.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct VisibleObject {
-    /// In words.
+    /// The name of the object in the text.
     pub name: String,
     /// Left, top, right, bottom.
     pub bounding_box: [u16; 4],
 }
 
-/// Why a candidate is not a reasoning followed by an action: what was expected and what came.
+/// Why a candidate is not a reasoning followed by an action.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Malformed {
-    /// What was expected and what came.
+    /// What was expected and what was found.
     pub reason: String,
 }
 
 impl Malformed {
-    /// With the reason in words.
+    /// A malformed candidate with this reason.
     pub fn new(reason: impl Into<String>) -> Malformed {
         Malformed { reason: reason.into() }
     }
@@ -94,12 +97,16 @@ fn sections(text: &str) -> Result<[&str; 8], Malformed> {
     for (index, expected) in TAGS.iter().enumerate() {
         match found.get(index) {
             Some((_, tag)) if tag == expected => {}
-            Some((_, tag)) => return Err(Malformed::new(format!("expected {expected} got {tag}"))),
-            None => return Err(Malformed::new(format!("expected {expected} got the end"))),
+            Some((_, tag)) => {
+                return Err(Malformed::new(format!("expected {expected}, got {tag}")));
+            }
+            None => return Err(Malformed::new(format!("expected {expected}, got the end"))),
         }
     }
     if let Some((_, tag)) = found.get(TAGS.len()) {
-        return Err(Malformed::new(format!("expected the end after ACTION: got {tag}")));
+        return Err(Malformed::new(format!(
+            "expected the end of the text after \"ACTION:\", got {tag}"
+        )));
     }
     let before = text[..found[0].0].trim();
     if !before.is_empty() {
@@ -108,26 +115,29 @@ fn sections(text: &str) -> Result<[&str; 8], Malformed> {
     let (last, tag) = found[TAGS.len() - 1];
     let after = text[last + tag.len()..].trim();
     if !after.is_empty() {
-        return Err(Malformed::new(format!("expected action tokens after ACTION: got {after:?}")));
+        return Err(Malformed::new(format!(
+            "expected action tokens after \"ACTION:\", got {after:?}"
+        )));
     }
     let mut sections = [""; 8];
     for (index, section) in sections.iter_mut().enumerate() {
         let (start, tag) = found[index];
         *section = text[start + tag.len()..found[index + 1].0].trim();
         if section.is_empty() {
-            return Err(Malformed::new(format!("expected text after {tag} got none")));
+            return Err(Malformed::new(format!("expected text after {tag:?}, got none")));
         }
     }
     Ok(sections)
 }
 
-/// The last tag that ends behind `from`, as an index of [`TAGS`]; none when no tag does.
+/// Index in [`TAGS`] of the last tag that ends after byte `from`, or `None`.
 pub fn last_tag(text: &str, from: usize) -> Option<usize> {
     let found = tags_in(text).into_iter().rev().find(|(at, tag)| at + tag.len() > from);
     found.and_then(|(_, tag)| TAGS.iter().position(|known| *known == tag))
 }
 
-/// Every tag with its byte offset; it begins the text or follows a space, and the longest wins.
+/// All tags with their byte offsets. A tag starts the text or follows white space; of several tags
+/// the longest matches.
 fn tags_in(text: &str) -> Vec<(usize, &'static str)> {
     let mut found = Vec::new();
     let mut position = 0;
@@ -154,7 +164,7 @@ fn visible_objects(text: &str) -> Result<Vec<VisibleObject>, Malformed> {
     while !rest.is_empty() {
         let expected = || {
             Malformed::new(format!(
-                "expected name [x1, y1, x2, y2] in VISIBLE OBJECTS: got {rest:?}"
+                "expected name [x1, y1, x2, y2] in VISIBLE OBJECTS, got {rest:?}"
             ))
         };
         let (name, after) = rest.split_once('[').ok_or_else(expected)?;
@@ -176,7 +186,7 @@ fn visible_objects(text: &str) -> Result<Vec<VisibleObject>, Malformed> {
 
 /// `[x, y]`, or a flat list of several points.
 fn gripper_position(text: &str) -> Result<Vec<[u16; 2]>, Malformed> {
-    let expected = || Malformed::new(format!("expected [x, y] in GRIPPER POSITION: got {text:?}"));
+    let expected = || Malformed::new(format!("expected [x, y] in GRIPPER POSITION, got {text:?}"));
     let inner = text.strip_prefix('[').and_then(|text| text.strip_suffix(']'));
     let numbers = coordinates(inner.ok_or_else(expected)?)?;
     if numbers.len() % 2 != 0 {
@@ -191,7 +201,9 @@ fn coordinates(text: &str) -> Result<Vec<u16>, Malformed> {
         let digits = text.bytes().all(|byte| byte.is_ascii_digit());
         let number = text.parse::<u16>().ok().filter(|&n| digits && n <= COORDINATE_MAX);
         number.ok_or_else(|| {
-            Malformed::new(format!("expected a coordinate of 0 to {COORDINATE_MAX} got {text:?}"))
+            Malformed::new(format!(
+                "expected a coordinate from 0 to {COORDINATE_MAX}, got {text:?}"
+            ))
         })
     };
     text.split(',').map(number).collect()
@@ -208,7 +220,7 @@ mod tests {
         GRIPPER POSITION: [120, 84] ACTION:";
 
     #[test]
-    fn a_good_text_parses_whole() {
+    fn a_well_formed_text_is_parsed_completely() {
         let object =
             |name: &str, bounding_box| VisibleObject { name: name.to_string(), bounding_box };
         let expected = Reasoning {
@@ -236,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn every_kind_of_malformed_text_is_refused_in_words() {
+    fn every_kind_of_malformed_text_is_refused_with_a_reason() {
         fn check(from: &str, to: &str, expected: &str) {
             let text = GOOD.replacen(from, to, 1);
             assert_ne!(text, GOOD, "{from:?} is in the good text");
@@ -245,26 +257,30 @@ mod tests {
                 Ok(_) => panic!("expected a refusal of {text}"),
             }
         }
-        check(GOOD, "", "expected TASK: got the end");
-        check(" ACTION:", "", "expected ACTION: got the end");
-        check("PLAN:", "PLANS", "expected PLAN: got VISIBLE OBJECTS:");
-        check("SUBTASK REASONING:", "SUBTASK:", "expected SUBTASK REASONING: got SUBTASK:");
-        check(" MOVE: move", " MOVE REASONING: move", "expected MOVE: got MOVE REASONING:");
-        check(" PLAN:", " PLAN: a PLAN:", "expected VISIBLE OBJECTS: got PLAN:");
-        check("ACTION:", "ACTION: TASK:", "expected the end after ACTION: got TASK:");
+        check(GOOD, "", "expected TASK:, got the end");
+        check(" ACTION:", "", "expected ACTION:, got the end");
+        check("PLAN:", "PLANS", "expected PLAN:, got VISIBLE OBJECTS:");
+        check("SUBTASK REASONING:", "SUBTASK:", "expected SUBTASK REASONING:, got SUBTASK:");
+        check(" MOVE: move", " MOVE REASONING: move", "expected MOVE:, got MOVE REASONING:");
+        check(" PLAN:", " PLAN: a PLAN:", "expected VISIBLE OBJECTS:, got PLAN:");
+        check(
+            "ACTION:",
+            "ACTION: TASK:",
+            "expected the end of the text after \"ACTION:\", got TASK:",
+        );
         check(" TASK:", "so TASK:", "expected TASK: first, got \"so\"");
-        check("ACTION:", "ACTION: now", "expected action tokens after ACTION: got \"now\"");
-        check("MOVE: move left down", "MOVE:", "expected text after MOVE: got none");
+        check("ACTION:", "ACTION: now", "expected action tokens after \"ACTION:\", got \"now\"");
+        check("MOVE: move left down", "MOVE:", "expected text after \"MOVE:\", got none");
         check(
             "[120, 84]",
             "[120, 84, 3]",
-            "expected [x, y] in GRIPPER POSITION: got \"[120, 84, 3]\"",
+            "expected [x, y] in GRIPPER POSITION, got \"[120, 84, 3]\"",
         );
-        check("[120, 84]", "120, 84", "expected [x, y] in GRIPPER POSITION: got \"120, 84\"");
-        check("84]", "300]", "expected a coordinate of 0 to 256 got \"300\"");
-        check("84]", "+4]", "expected a coordinate of 0 to 256 got \"+4\"");
-        check("84]", "]", "expected a coordinate of 0 to 256 got \"\"");
-        let objects = "expected name [x1, y1, x2, y2] in VISIBLE OBJECTS: got";
+        check("[120, 84]", "120, 84", "expected [x, y] in GRIPPER POSITION, got \"120, 84\"");
+        check("84]", "300]", "expected a coordinate from 0 to 256, got \"300\"");
+        check("84]", "+4]", "expected a coordinate from 0 to 256, got \"+4\"");
+        check("84]", "]", "expected a coordinate from 0 to 256, got \"\"");
+        let objects = "expected name [x1, y1, x2, y2] in VISIBLE OBJECTS, got";
         let all = "\"spoon [10, 24, 36, 48] blue towel [60, 62, 90, 256]\"";
         check("48], b", "48] b", &format!("{objects} {all}"));
         let last = "\"blue towel [60, 62, 90]\"";

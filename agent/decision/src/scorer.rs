@@ -1,4 +1,4 @@
-//! The seam for scorers: a learned verifier, a judge model, a script.
+//! The interface of scorers: a learned verifier, a judge model, a script.
 
 use anyhow::Result;
 use async_trait::async_trait;
@@ -6,36 +6,38 @@ use protocol::message::Image;
 
 use crate::{ActionSpace, Candidate, TrackedObjects};
 
-/// The candidates of one decision, with all that a scorer may look at.
+/// The candidates of one decision, with everything that a scorer may use.
 #[derive(Clone, Copy, Debug)]
 pub struct ScoringRequest<'a> {
-    /// What the policy saw.
+    /// The policy's input image.
     pub image: &'a Image,
-    /// What the robot felt, as the task's description says.
+    /// The robot's state, with the dimensions in the task's description.
     pub state: &'a [f32],
-    /// What the robot was told.
+    /// The language instruction for the robot.
     pub instruction: &'a str,
-    /// In the order of their streams; at least one, some of them malformed.
+    /// In the order of their random streams; at least one. Some may be malformed.
     pub candidates: &'a [Candidate],
-    /// Where the reasoning of this episode, these candidates' included, sees the objects.
+    /// Object positions according to the reasoning of this episode, including these candidates.
     pub tracked: TrackedObjects,
-    /// How the candidates' actions compare.
+    /// How to compare the candidates' actions.
     pub action_space: &'a ActionSpace,
 }
 
-/// Scores candidates. An error is a fault of the one episode whose request failed.
+/// Scores candidates. An error is a fault of only that episode whose request failed.
 #[async_trait]
 pub trait Scorer: Send + Sync {
-    /// What it computes, in hexadecimal: scorers with one digest give the same scores.
+    /// Identity of the computation, in hexadecimal: scorers with the same digest give the same
+    /// scores.
     fn digest(&self) -> &str;
 
-    /// The logit of each candidate of each request; that of a malformed candidate means nothing.
+    /// The logits of each request's candidates; the logit of a malformed candidate has no meaning.
     ///
-    /// Logits, not probabilities: probabilities near 1 are equal in 32 bits long before the logits are.
+    /// These are logits because probabilities near 1 become equal in 32 bits while their logits
+    /// still differ.
     async fn score(&self, requests: &[ScoringRequest<'_>]) -> Vec<Result<Vec<f32>>>;
 }
 
-/// The probability that belongs to a logit.
+/// The probability of a logit (sigmoid).
 pub fn probability(logit: f32) -> f32 {
     (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
 }

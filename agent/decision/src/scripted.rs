@@ -1,4 +1,4 @@
-//! Policies and scorers that follow a script, for tests of whatever uses a [`Decider`](crate::Decider).
+//! Scripted policies and scorers for tests that use a [`Decider`](crate::Decider).
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, PoisonError};
@@ -11,26 +11,26 @@ use crate::{
     ProposalRequest, Reasoning, Scorer, ScoringRequest,
 };
 
-/// What a scripted policy answers to one request.
+/// The scripted answer to one request.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
-    /// Candidates with these x motions, as many as are asked for from the list's beginning, over and over; a motion that
-    /// is none makes a malformed candidate.
+    /// Candidates with these x motions. The list repeats if more candidates are requested; `None`
+    /// makes a malformed candidate.
     Motions(Vec<Option<f32>>),
-    /// The request fails, and with it every batch that it is in.
+    /// The request fails, and with it every batch that contains it.
     Fails(String),
 }
 
-/// Answers every request whose instruction is known with its own script, others with one motion.
+/// Answers a request by the script for its instruction; any other instruction gets one motion.
 pub struct ScriptedPolicy {
     info: PolicyInfo,
     answers: Mutex<Vec<(String, VecDeque<Answer>)>>,
-    /// Sizes of the batches that it was asked for.
+    /// Sizes of the requested batches.
     batches: Mutex<Vec<usize>>,
 }
 
 impl ScriptedPolicy {
-    /// A policy of 7 numbers with images of no pixels.
+    /// A policy with 7 action dimensions and without images.
     pub fn new() -> ScriptedPolicy {
         ScriptedPolicy {
             info: PolicyInfo {
@@ -45,7 +45,7 @@ impl ScriptedPolicy {
         }
     }
 
-    /// The answers to requests with this instruction, one for each; the last one stays.
+    /// The answers to consecutive requests with this instruction; the last one repeats.
     pub fn with(self, instruction: &str, answers: impl IntoIterator<Item = Answer>) -> Self {
         let answers = answers.into_iter().collect();
         self.answers
@@ -55,7 +55,7 @@ impl ScriptedPolicy {
         self
     }
 
-    /// Sizes of the batches that it was asked for so far.
+    /// Sizes of the batches requested so far.
     pub fn batches(&self) -> Vec<usize> {
         self.batches.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -91,7 +91,8 @@ impl Policy for ScriptedPolicy {
             Answer::Motions(_) => None,
         });
         if let Some((instruction, reason)) = failing {
-            // Alone it uses up its answer; in a batch everybody is asked again.
+            // Only a single request uses up its answer: after a failed batch every request is
+            // repeated alone.
             if requests.len() == 1 {
                 self.answer(instruction, true);
             }
@@ -109,7 +110,7 @@ impl Policy for ScriptedPolicy {
     }
 }
 
-/// A candidate that moves by `x`; a malformed one for none.
+/// A candidate that moves by `x`; malformed for `None`.
 pub fn candidate(x: Option<f32>) -> Result<Candidate> {
     let parsed = match x {
         Some(x) => Ok(Parsed {
@@ -129,7 +130,7 @@ pub fn candidate(x: Option<f32>) -> Result<Candidate> {
     })
 }
 
-/// Scores a candidate by its x motion, or fails for an instruction.
+/// Scores a candidate by its x motion; may fail for one instruction.
 pub struct ScriptedScorer {
     digest: String,
     sign: f32,
@@ -137,7 +138,7 @@ pub struct ScriptedScorer {
 }
 
 impl ScriptedScorer {
-    /// The farther a candidate moves, the better; with `sign` -1 the other way round.
+    /// Larger motions get higher scores, or lower ones with `sign` -1.
     pub fn new(digest: &str, sign: f32) -> ScriptedScorer {
         ScriptedScorer { digest: digest.to_owned(), sign, failing: None }
     }
@@ -158,7 +159,7 @@ impl Scorer for ScriptedScorer {
     async fn score(&self, requests: &[ScoringRequest<'_>]) -> Vec<Result<Vec<f32>>> {
         let score = |request: &ScoringRequest<'_>| {
             if self.failing.as_deref() == Some(request.instruction) {
-                return Err(anyhow!("the judge is silent"));
+                return Err(anyhow!("the scripted scorer fails"));
             }
             let motion = |candidate: &Candidate| {
                 candidate.action().map_or(f32::NAN, |action| action.actions.first()[0])

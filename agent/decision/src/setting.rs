@@ -1,13 +1,13 @@
-//! A setting: how the candidates of an episode are drawn and how one of them is chosen.
+//! A setting: how the candidates of an episode are sampled and how one of them is selected.
 
 use std::fmt;
 
 use crate::Strategy;
 
-/// How the candidates of an episode are drawn and chosen.
+/// How the candidates of an episode are sampled and selected.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Setting {
-    /// How to choose.
+    /// How a candidate is selected.
     pub strategy: Strategy,
     /// Candidates per decision.
     pub candidates: u32,
@@ -16,7 +16,7 @@ pub struct Setting {
 }
 
 impl Setting {
-    /// Normalises a setting: greedy implies temperature 0; N = 1 implies a single sample.
+    /// Normalises a setting: greedy implies temperature 0, and N = 1 implies a single sample.
     pub fn new(strategy: Strategy, candidates: u32, temperature: f32) -> Setting {
         let drawn = strategy.candidates(candidates as usize) as u32;
         let strategy =
@@ -24,7 +24,8 @@ impl Setting {
         Setting { strategy, candidates: drawn, temperature: strategy.temperature(temperature) }
     }
 
-    /// All different settings of the given strategies, temperatures and numbers of candidates, in that order.
+    /// All distinct settings of the given strategies, temperatures and numbers of candidates, in
+    /// that order.
     pub fn all(strategies: &[Strategy], temperatures: &[f32], candidates: &[u32]) -> Vec<Setting> {
         let mut settings: Vec<Setting> = Vec::new();
         for strategy in strategies {
@@ -60,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn settings_that_are_the_same_are_run_once() {
+    fn equal_settings_are_run_once() {
         let settings = Setting::all(
             &[Strategy::Greedy, Strategy::Sample, Strategy::Verifier],
             &[1.0, 0.7],

@@ -1,49 +1,58 @@
-//! How one of several candidates is chosen: a strategy turns alternatives into an index.
+//! Strategies: how one of several candidates is selected.
 //!
-//! Every strategy sees plain data, so that a choice can be repeated from a record. A malformed candidate is never chosen;
-//! of equally good candidates the first wins. When nothing can be chosen the answer is `None` and the robot holds still.
+//! A strategy uses plain data only, so that its choice can be repeated from a record. It never
+//! selects a malformed candidate; among equally good candidates it selects the first. If no
+//! candidate can be selected the result is `None` and the robot holds still.
 
 use std::fmt;
 use std::str::FromStr;
 
 use crate::{Action, ActionSpace, CandidateAction};
 
-/// Two candidates vote for each other in [`Strategy::Majority`] when no continuous action token differs by more bins.
+/// Two candidates vote for each other in [`Strategy::Majority`] if no continuous action token
+/// differs by more than this number of bins.
 ///
-/// Exact agreement of seven tokens is rare with 256 bins per dimension, so that a strict vote would be a plain sample.
+/// Exact agreement of seven tokens is rare with 256 bins per dimension: a strict vote would be
+/// equivalent to a single sample.
 pub const MAJORITY_TOLERANCE_BINS: u32 = 3;
 
-/// Logits that one unit of mean distance costs in [`Strategy::VerifierMedoid`].
+/// Weight of one unit of mean distance in [`Strategy::VerifierMedoid`], in logits.
 ///
-/// Set before any episode was run, so no result has shaped it; to be changed on tuning seeds only.
+/// It was fixed before any episode was run, so that no result has influenced it. Change it on
+/// tuning seeds only.
 pub const MEDOID_WEIGHT_LOGITS: f64 = 4.0;
 
-/// Bins between the lowest and the highest action token: the unit of the distance between two candidates.
+/// Bins between the lowest and the highest action token; the unit of the distance between two
+/// candidates.
 const BINS_SPAN: f64 = 255.0;
 
-/// A rule that picks the candidate to execute.
+/// A rule that selects the candidate to execute.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Strategy {
-    /// The most likely token at every place; one candidate.
+    /// The most likely token at every position; one candidate.
     Greedy,
-    /// One candidate drawn at the temperature.
+    /// A single sample (N = 1) at the temperature.
     Sample,
-    /// The first well-formed one of several candidates: what a single sample gains from having a second chance alone.
+    /// The first well-formed candidate: shows what several attempts gain without any comparison.
     FirstWellFormed,
-    /// Self-consistency: the candidate that most candidates agree with (see [`MAJORITY_TOLERANCE_BINS`]).
+    /// Self-consistency: the candidate that agrees with the most others (see
+    /// [`MAJORITY_TOLERANCE_BINS`]).
     Majority,
     /// The candidate with the smallest summed distance to the others.
     Medoid,
-    /// The highest verifier score.
+    /// The candidate with the highest verifier score.
     Verifier,
-    /// The lowest verifier score: the control that shows whether the score means anything.
+    /// The candidate with the lowest verifier score: a control for whether the score is
+    /// informative.
     Worst,
-    /// The highest logit minus [`MEDOID_WEIGHT_LOGITS`] times the mean distance to the other candidates.
+    /// The candidate with the highest logit minus [`MEDOID_WEIGHT_LOGITS`] times its mean distance
+    /// to the others.
     ///
-    /// Logits are compared unstandardised on purpose: where the verifier sees no difference the medoid decides, and a
-    /// confident verifier overrules agreement.
+    /// Logits are deliberately not standardised: if the verifier's logits are equal the medoid
+    /// decides, and a confident verifier overrules agreement.
     VerifierMedoid,
-    /// The candidate nearest to the scripted expert's action: the bound on what choosing can reach, for evaluation only.
+    /// The candidate nearest to the scripted expert's action: an upper bound of what selection can
+    /// reach. For evaluation only.
     Oracle,
 }
 
@@ -76,7 +85,8 @@ impl Strategy {
         }
     }
 
-    /// How many candidates to propose when `requested` are asked for: greedy and one sample need a single one.
+    /// Number of candidates to propose if `requested` are requested: greedy and single sample need
+    /// one.
     pub fn candidates(self, requested: usize) -> usize {
         match self {
             Strategy::Greedy | Strategy::Sample => 1,
@@ -84,7 +94,7 @@ impl Strategy {
         }
     }
 
-    /// The sampling temperature when `requested` is asked for: greedy is temperature 0.
+    /// Sampling temperature if `requested` is requested: greedy is temperature 0.
     pub fn temperature(self, requested: f32) -> f32 {
         match self {
             Strategy::Greedy => 0.0,
@@ -92,26 +102,27 @@ impl Strategy {
         }
     }
 
-    /// Whether the choice among the well-formed candidates depends on what they are: the scores of such choices run high
-    /// or low by selection.
+    /// Whether the strategy compares the well-formed candidates. The scores of selected candidates
+    /// are then biased by the selection.
     pub fn compares_candidates(self) -> bool {
         !matches!(self, Strategy::Greedy | Strategy::Sample | Strategy::FirstWellFormed)
     }
 
-    /// Whether [`Alternatives::logits`] must be there.
+    /// Whether [`Alternatives::logits`] is required.
     pub fn needs_verifier(self) -> bool {
         matches!(self, Strategy::Verifier | Strategy::Worst | Strategy::VerifierMedoid)
     }
 
-    /// Whether [`Alternatives::expert_action`] must be there.
+    /// Whether [`Alternatives::expert_action`] is required.
     pub fn needs_expert(self) -> bool {
         self == Strategy::Oracle
     }
 
-    /// The index of the candidate to execute, or `None` when no candidate is well formed.
+    /// The index of the candidate to execute, or `None` if no candidate is well formed.
     ///
-    /// Panics when the decision lacks what [`needs_verifier`](Self::needs_verifier) or
-    /// [`needs_expert`](Self::needs_expert) asks for, or holds a number that is not finite: both are bugs of the caller.
+    /// Panics if the input lacks what [`needs_verifier`](Self::needs_verifier) or
+    /// [`needs_expert`](Self::needs_expert) requires, or contains a number that is not finite: both
+    /// are bugs of the caller.
     pub fn choose(self, alternatives: &Alternatives<'_>) -> Option<usize> {
         let (candidates, space) = (alternatives.candidates, alternatives.action_space);
         match self {
@@ -129,7 +140,7 @@ impl Strategy {
             }),
             Strategy::Oracle => {
                 let expert =
-                    alternatives.expert_action.expect("the oracle is given the expert's action");
+                    alternatives.expert_action.expect("the oracle requires the expert's action");
                 largest(candidates, |_, own| {
                     -expert_distance(own.actions.first(), expert, &space.scale)
                 })
@@ -153,7 +164,7 @@ impl FromStr for Strategy {
     }
 }
 
-/// A strategy's name that none has.
+/// The name of a strategy that does not exist.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UnknownStrategy {
     name: String,
@@ -168,22 +179,22 @@ impl fmt::Display for UnknownStrategy {
 
 impl std::error::Error for UnknownStrategy {}
 
-/// All that a strategy may look at in one decision.
+/// The input of a strategy in one decision.
 #[derive(Clone, Copy, Debug)]
 pub struct Alternatives<'a> {
-    /// One entry per candidate; `None` is a malformed one.
+    /// One entry per candidate; `None` for a malformed one.
     pub candidates: &'a [Option<CandidateAction<'a>>],
-    /// The scorer's logit of each candidate, as [`crate::Scorer::score`] gives them.
+    /// The scorer's logit of each candidate, see [`crate::Scorer::score`].
     pub logits: Option<&'a [f32]>,
-    /// The scripted expert's action at this state, in the units of the candidates' actions.
+    /// The scripted expert's action in this state, in the units of the candidates' actions.
     pub expert_action: Option<&'a [f32]>,
-    /// How the candidates' actions compare.
+    /// How to compare the candidates' actions.
     pub action_space: &'a ActionSpace,
 }
 
 impl Alternatives<'_> {
     fn logit(&self, index: usize) -> f64 {
-        let logits = self.logits.expect("a strategy that needs a scorer is given its logits");
+        let logits = self.logits.expect("a strategy that needs a verifier requires logits");
         assert_eq!(logits.len(), self.candidates.len(), "one logit per candidate");
         f64::from(logits[index])
     }
@@ -206,7 +217,7 @@ fn largest(
     best.map(|(index, _)| index)
 }
 
-/// How many other candidates agree with this one.
+/// Number of other candidates that agree with this one.
 fn votes(alternatives: &Alternatives<'_>, index: usize, own: &CandidateAction<'_>) -> f64 {
     let space = alternatives.action_space;
     others(alternatives.candidates, index).filter(|other| agree(own, other, space)).count() as f64
@@ -219,9 +230,10 @@ fn agree(a: &CandidateAction<'_>, b: &CandidateAction<'_>, space: &ActionSpace) 
     })
 }
 
-/// The mean distance to the other well-formed candidates; 0 when there is none.
+/// The mean distance to the other well-formed candidates; 0 if there are none.
 ///
-/// Ranking by the mean is ranking by the sum, and the mean keeps its meaning when some candidates are malformed.
+/// The mean ranks candidates as the sum does, and stays comparable if some candidates are
+/// malformed.
 pub fn distance_mean(
     candidates: &[Option<CandidateAction<'_>>],
     index: usize,
@@ -234,15 +246,16 @@ pub fn distance_mean(
     sum / f64::from(count.max(1))
 }
 
-/// How two candidates differ in one number of one action.
+/// The difference between two candidates in one dimension of one action.
 enum Difference {
-    /// Of a continuous number, in bins of [`BINS_SPAN`] to its whole range.
+    /// For a continuous dimension, in bins; [`BINS_SPAN`] is the whole range.
     Bins(f64),
-    /// Of the gripper: whether one opens and the other closes.
+    /// For the gripper: whether one opens and the other closes.
     Gripper(bool),
 }
 
-/// Number by number. In bins where both candidates have action tokens, else by the numbers and their scale.
+/// The difference in each dimension: in bins if both candidates have action tokens, otherwise from
+/// the numbers and their scale.
 fn differences(
     a: &CandidateAction<'_>,
     b: &CandidateAction<'_>,
@@ -267,7 +280,8 @@ fn differences(
     a_numbers.iter().zip(&b_numbers).enumerate().map(difference).collect()
 }
 
-/// Summed differences of the continuous numbers, each as a part of its whole range, plus 1 for the other gripper side.
+/// Sum over the continuous dimensions of the difference relative to the whole range, plus 1 for
+/// each opposite gripper command.
 fn candidate_distance(
     a: &CandidateAction<'_>,
     b: &CandidateAction<'_>,
@@ -294,8 +308,8 @@ fn others<'a, 'b>(
         .filter_map(|(_, candidate)| candidate.as_ref())
 }
 
-/// Euclidean distance of the first action in units of the action scale; a dimension without range cannot tell candidates
-/// apart and is left out.
+/// Euclidean distance of the first action in units of the action scale. Dimensions without a range
+/// are ignored.
 fn expert_distance(action: &[f32], expert: &[f32], scale: &[f32]) -> f64 {
     let squares = action.iter().zip(expert).zip(scale).filter(|(_, scale)| **scale > 0.0);
     let squares =

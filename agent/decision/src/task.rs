@@ -1,20 +1,20 @@
-//! Which task, in which variant.
+//! A task in one variant.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// The variant that a task has unless another is asked for.
+/// The variant of a task unless another is requested.
 pub const VARIANT_DEFAULT: &str = "default";
 
-/// A task in one variant, as a server's description names it.
+/// A task in one variant, named as in a server's description.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskId {
-    /// The task's name; of the Bridge tasks, SIMPLER's.
+    /// Name of the task. The Bridge tasks have SIMPLER's names.
     pub task: String,
-    /// `default`, or what is changed.
+    /// `default`, or the name of what is changed.
     pub variant: String,
 }
 
@@ -24,14 +24,14 @@ impl TaskId {
         TaskId { task: task.into(), variant: variant.into() }
     }
 
-    /// A task as it is.
+    /// A task in its default variant.
     pub fn default_of(task: impl Into<String>) -> TaskId {
         TaskId::new(task, VARIANT_DEFAULT)
     }
 }
 
 impl fmt::Display for TaskId {
-    /// `task`, or `task/variant` for another variant than the default one.
+    /// `task`, or `task/variant` for a variant other than the default.
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.variant == VARIANT_DEFAULT {
             formatter.pad(&self.task)
@@ -44,8 +44,8 @@ impl fmt::Display for TaskId {
 impl FromStr for TaskId {
     type Err = String;
 
-    /// Reads `task` or `task/variant`. A task's own name may hold slashes (`ALE/Pong-v5/default`): the variant is what
-    /// follows the last one.
+    /// Parses `task` or `task/variant`. A task's name may contain slashes (`ALE/Pong-v5/default`):
+    /// the variant follows the last one.
     fn from_str(text: &str) -> Result<TaskId, String> {
         let (task, variant) = text.rsplit_once('/').unwrap_or((text, VARIANT_DEFAULT));
         if task.is_empty() || variant.is_empty() {

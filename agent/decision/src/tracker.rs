@@ -1,36 +1,38 @@
-//! Where the objects are, by what the reasoning of an episode has said so far.
+//! Object positions estimated from the reasoning of an episode so far.
 //!
-//! Every candidate says where it sees the objects. One such box is a few pixels off, more when the gripper covers the
-//! object; but objects stand still until they are touched, so the mean of all boxes so far is much more precise than any
-//! of them.
+//! Every candidate's reasoning names bounding boxes. A single box is a few pixels off, and more if
+//! the gripper covers the object. Objects do not move until they are touched, so the mean of all
+//! boxes so far is much more precise than any single one.
 
 use crate::Reasoning;
 
-/// Left, top, right, bottom in the square of 256 pixels.
+/// Left, top, right, bottom in an image of 256 x 256 pixels.
 pub type BoundingBox = [f32; 4];
 
-/// Stages of a manipulation task that head for a place.
+/// Number of stages of a manipulation task, each with a target object.
 pub const STAGES: usize = 2;
 
-/// A box whose side is farther than this from the median of all is left out of the mean, in pixels.
+/// A box is an outlier if one of its sides is farther than this from the median, in pixels.
+/// Outliers do not enter the mean.
 const OUTLIER_PIXELS: f32 = 24.0;
-/// Steps in a row that must be about grasping again before the object counts as dropped elsewhere.
+/// After this number of consecutive steps about grasping again, the object counts as dropped at
+/// another position.
 const DROPPED_STEPS: u32 = 2;
 
-/// What the gripper heads for.
+/// The stage of a manipulation task.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stage {
-    /// The first object of the reasoning, which is to be moved.
+    /// The target is the first object of the reasoning, which has to be moved.
     Grasp,
-    /// The second one, where the first is to go.
+    /// The target is the second object, the destination of the first.
     Place,
 }
 
 impl Stage {
-    /// In the order of a task.
+    /// All stages, in the order of a task.
     pub const ALL: [Stage; STAGES] = [Stage::Grasp, Stage::Place];
 
-    /// By the first word of `SUBTASK:`; none when it heads for nothing.
+    /// The stage by the first word of `SUBTASK:`, or `None` if it has no target object.
     fn of(subtask: &str) -> Option<Stage> {
         match subtask.split_whitespace().next()? {
             "reach" | "grasp" => Some(Stage::Grasp),
@@ -40,17 +42,17 @@ impl Stage {
     }
 }
 
-/// What a candidate says about the scene.
+/// What one candidate's reasoning says about the objects.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ReasoningFeatures {
-    /// The stage that it is in.
+    /// The stage of the candidate's current subtask.
     pub stage: Option<Stage>,
-    /// Of the object that each stage heads for.
+    /// The box of each stage's target object.
     pub bounds: [BoundingBox; STAGES],
 }
 
 impl ReasoningFeatures {
-    /// None when the reasoning does not name two objects.
+    /// `None` if the reasoning does not name two objects.
     pub fn of(reasoning: &Reasoning) -> Option<ReasoningFeatures> {
         let [first, second, ..] = reasoning.visible_objects.as_slice() else { return None };
         let bounds = [first, second].map(|object| object.bounding_box.map(f32::from));
@@ -58,7 +60,7 @@ impl ReasoningFeatures {
     }
 }
 
-/// What has been said in an episode so far.
+/// The estimates of an episode so far.
 #[derive(Clone, Debug, Default)]
 pub struct ObjectTracker {
     said: [Vec<BoundingBox>; STAGES],
@@ -66,17 +68,17 @@ pub struct ObjectTracker {
     grasping_steps: u32,
 }
 
-/// What the reasoning of this step and of all before it says together.
+/// The combined estimate from the reasoning of this and all previous steps.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TrackedObjects {
-    /// The stage that most candidates are in.
+    /// The stage of most candidates.
     pub stage: Option<Stage>,
-    /// Where the object that each stage heads for stands.
+    /// The box of each stage's target object.
     pub bounds: [Option<BoundingBox>; STAGES],
 }
 
 impl ObjectTracker {
-    /// Takes in what the candidates of one step say.
+    /// Updates the estimate with the candidates' reasoning at one step.
     pub fn note(&mut self, said: &[ReasoningFeatures]) -> TrackedObjects {
         let count = |stage| said.iter().filter(|one| one.stage == stage).count();
         let stages = [None, Some(Stage::Place), Some(Stage::Grasp)];
@@ -98,7 +100,8 @@ impl ObjectTracker {
         }
         if !said.is_empty() {
             let boxes = |stage: usize| said.iter().map(|one| one.bounds[stage]).collect();
-            // What is being grasped stands still; what is held does not.
+            // The object does not move while it is being grasped; once it is held it moves with the
+            // gripper.
             if stage == Some(Stage::Grasp) && !self.is_placing {
                 self.said[0].push(median(boxes(0)));
             }
@@ -108,7 +111,7 @@ impl ObjectTracker {
     }
 }
 
-/// Side by side.
+/// The median of each side.
 fn median(boxes: Vec<BoundingBox>) -> BoundingBox {
     std::array::from_fn(|side| {
         let mut values: Vec<f32> = boxes.iter().map(|bounds| bounds[side]).collect();
@@ -118,7 +121,7 @@ fn median(boxes: Vec<BoundingBox>) -> BoundingBox {
     })
 }
 
-/// Of the boxes that are near their median.
+/// The mean of the boxes that are near their median.
 fn mean(boxes: &[BoundingBox]) -> Option<BoundingBox> {
     if boxes.is_empty() {
         return None;
@@ -159,10 +162,11 @@ mod tests {
         ]);
         let tracked = tracker.note(&[said(GRASP, 10.0, 154.0)]);
         assert_eq!(tracked.stage, GRASP);
-        // Medians 102, 106 and 10 of the first object, of which the last is an outlier; 150, 152 and 154 of the second.
+        // The first object's medians are 102, 106 and 10, of which 10 is an outlier; the second
+        // object's are 150, 152 and 154.
         assert_eq!(tracked.bounds[0], Some([104.0, 50.0, 114.0, 70.0]));
         assert_eq!(tracked.bounds[1], Some([152.0, 50.0, 162.0, 70.0]));
-        // No candidate is well formed: nothing new is known, and the gripper heads for nothing.
+        // No candidate is well formed: the boxes do not change and there is no stage.
         let tracked = tracker.note(&[]);
         assert_eq!((tracked.stage, tracked.bounds[0]), (None, Some([104.0, 50.0, 114.0, 70.0])));
     }
@@ -173,7 +177,7 @@ mod tests {
         let left = |tracked: TrackedObjects| tracked.bounds[0].map(|bounds| bounds[0]);
         tracker.note(&[said(GRASP, 100.0, 150.0)]);
         assert_eq!(left(tracker.note(&[said(PLACE, 130.0, 150.0)])), Some(100.0));
-        // One step that says otherwise may be a slip.
+        // A single contradicting step may be an error.
         assert_eq!(left(tracker.note(&[said(GRASP, 140.0, 150.0)])), Some(100.0));
         assert_eq!(left(tracker.note(&[said(GRASP, 144.0, 150.0)])), Some(144.0));
         let tracked = tracker.note(&[said(GRASP, 146.0, 150.0), said(None, 146.0, 150.0)]);

@@ -1,4 +1,4 @@
-//! Why an episode broke: always an error, never an outcome.
+//! Faults: why an attempt failed. A fault is always an error, never an outcome.
 
 use std::fmt;
 
@@ -7,44 +7,44 @@ use protocol::{CodecError, FaultKind, transport};
 use store::queue::FaultScope;
 use thiserror::Error;
 
-/// What can go wrong between an agent and its environment. The episode is void in every case but
-/// [`EnvironmentFault::Refused`], which leaves the world as it was.
+/// A fault of the environment or of the connection to it. The episode is void after every fault
+/// except [`EnvironmentFault::Refused`], which leaves the environment unchanged.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum EnvironmentFault {
-    /// The server's liveliness token is gone: its process has ended.
+    /// The server's liveliness token disappeared: its process ended.
     ServerLost {
         /// The server's id.
         server: String,
     },
-    /// Nothing is connected any more: the router or the network between has failed.
+    /// Nothing is connected any more: the router or the network failed.
     LinkLost {
         /// The server's id.
         server: String,
     },
-    /// No answer came though the server's process lives: its simulation is stuck, or far too slow.
+    /// The server process is alive but did not reply: its simulation is stuck or far too slow.
     TimedOut {
         /// The server's id.
         server: String,
-        /// What was asked.
+        /// The request that was sent.
         asked: &'static str,
-        /// How long an answer was waited for.
+        /// How long the agent waited for a reply.
         waited_secs: u64,
     },
-    /// The server, or the codec before it, says that the request is wrong.
+    /// The server or the encoder rejected the request.
     Refused {
-        /// What was expected and what came.
+        /// What was expected and what was received.
         reason: String,
     },
-    /// The world broke.
+    /// The environment failed.
     Faulted {
-        /// What broke.
+        /// What failed.
         kind: FaultKind,
-        /// In the server's words.
+        /// The server's reason.
         reason: String,
     },
-    /// The network itself failed, or a message is not what the protocol says.
+    /// The network failed, or a message violates the protocol.
     Wire {
-        /// What was expected and what came.
+        /// What was expected and what was received.
         reason: String,
     },
 }
@@ -62,7 +62,7 @@ impl EnvironmentFault {
         EnvironmentFault::Faulted { kind, reason: printable(reason) }
     }
 
-    /// For a message of ours that was not sent.
+    /// For a message that could not be encoded and was not sent.
     pub(crate) fn unsent(error: &CodecError) -> Self {
         EnvironmentFault::Refused { reason: error.to_string() }
     }
@@ -71,41 +71,45 @@ impl EnvironmentFault {
 impl fmt::Display for EnvironmentFault {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            EnvironmentFault::ServerLost { server } => write!(formatter, "server {server} is gone"),
+            EnvironmentFault::ServerLost { server } => {
+                write!(formatter, "server {server} was lost: its process ended")
+            }
             EnvironmentFault::LinkLost { server } => {
-                write!(formatter, "the link to server {server} is lost")
+                write!(formatter, "the connection to server {server} was lost")
             }
             EnvironmentFault::TimedOut { server, asked, waited_secs } => {
                 write!(
                     formatter,
-                    "server {server} is alive but did not answer {asked} for {waited_secs} s"
+                    "server {server} is alive but did not reply to {asked} for {waited_secs} s"
                 )
             }
             EnvironmentFault::Refused { reason } => write!(formatter, "refused: {reason}"),
             EnvironmentFault::Faulted { kind, reason } => write!(formatter, "{kind}: {reason}"),
-            EnvironmentFault::Wire { reason } => write!(formatter, "wire: {reason}"),
+            EnvironmentFault::Wire { reason } => {
+                write!(formatter, "protocol or network error: {reason}")
+            }
         }
     }
 }
 
 impl std::error::Error for EnvironmentFault {}
 
-/// Why an attempt at an episode has no outcome.
+/// Why an attempt has no outcome.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum AttemptFault {
-    /// The environment broke, or the way to it.
+    /// The environment or the connection to it failed.
     #[error("{0}")]
     Environment(#[from] EnvironmentFault),
     /// The policy or the scorer failed.
     #[error("{0}")]
     Decision(#[from] DecisionFault),
-    /// The rollout ended meanwhile.
+    /// The rollout was stopped during the attempt.
     #[error("stopped")]
     Stopped,
 }
 
 impl AttemptFault {
-    /// What may be the cause: a server or a link that fails says nothing about the episode.
+    /// The scope of the fault: a failed server or connection says nothing about the episode.
     pub fn scope(&self) -> FaultScope {
         match self {
             AttemptFault::Environment(fault) => match fault {
@@ -123,7 +127,7 @@ impl AttemptFault {
     }
 }
 
-/// Text of a peer without control characters: it reaches terminals, logs and pages.
+/// Replaces control characters in a peer's text, which is shown in terminals, logs and pages.
 pub(crate) fn printable(text: &str) -> String {
     text.chars().map(|letter| if letter.is_control() { '\u{fffd}' } else { letter }).collect()
 }

@@ -1,4 +1,4 @@
-//! The loop: rollouts over sessions of environment servers, and what is told of them.
+//! Runs episodes: rollouts over sessions of environment servers, and sinks for their events.
 //!
 //! ```text
 //! Experiment ─▶ Rollout ─▶ one worker per episode ─▶ DecisionBatcher ─▶ Decider
@@ -7,12 +7,12 @@
 //!                 └─ sinks: records, labels, videos, outcomes, progress
 //! ```
 
-// One run from beginning to end.
+// One run from start to end.
 pub mod experiment;
 pub mod rollout;
 pub mod stop;
 
-// Sessions of environments, over zenoh.
+// Sessions of environments over zenoh.
 pub mod fault;
 pub mod session;
 pub mod wire;
@@ -20,17 +20,17 @@ pub mod wire;
 #[cfg(test)]
 mod scripted;
 
-// What is told of a run.
+// Recording and reporting a run.
 pub mod sinks;
 
-// Servers on this machine.
+// Environment servers on this machine.
 pub mod servers;
 
 #[cfg(test)]
 mod tests {
     use store::record::Versions;
 
-    /// What records of tests say they were made with.
+    /// The versions in the records of tests.
     pub fn versions() -> Versions {
         Versions {
             rever: "0.0.0".to_owned(),

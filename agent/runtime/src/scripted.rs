@@ -1,4 +1,4 @@
-//! Environments that follow a script, for the tests of rollouts.
+//! Scripted environments for the tests of rollouts.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -14,25 +14,25 @@ use tokio::sync::watch;
 use crate::fault::EnvironmentFault;
 use crate::session::{Environment, Episode, Session, SessionInfo, SessionPool, SessionRequest};
 
-/// Control steps of every scripted episode.
+/// Number of control steps of every scripted episode.
 pub const STEPS_MAX: u32 = 3;
 
-/// What one attempt at an episode meets.
+/// What happens in one attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Script {
-    /// It runs to its end and succeeds.
+    /// The episode ends and succeeds.
     Succeeds,
-    /// Its reset breaks: the server is gone.
+    /// The reset fails: the server is lost.
     BreaksInReset,
-    /// Its second step breaks: the physics diverge.
+    /// The second step fails: the physics diverge.
     BreaksInStep,
-    /// It never ends.
+    /// The episode never ends.
     NeverEnds,
-    /// Its first step waits until the pool is told to go on.
+    /// The first step waits for [`ScriptedPool::go_on`].
     Waits,
 }
 
-/// A pool whose environments do what the script of the task says.
+/// A pool whose environments follow the scripts of the tasks.
 #[derive(Clone)]
 pub struct ScriptedPool {
     shared: Arc<Shared>,
@@ -60,13 +60,13 @@ pub struct ScriptedEpisode {
 }
 
 impl ScriptedPool {
-    /// A pool that offers every task; each attempt at an episode of a task takes the next of its scripts, the last one
-    /// stays.
+    /// A pool that offers every task. Each attempt uses the next script of its task; the last one
+    /// repeats.
     pub fn new(scripts: &[(&str, &[Script])]) -> ScriptedPool {
         ScriptedPool::made(scripts, false)
     }
 
-    /// A pool that never has a session.
+    /// A pool without sessions.
     pub fn empty() -> ScriptedPool {
         ScriptedPool::made(&[], true)
     }
@@ -85,12 +85,12 @@ impl ScriptedPool {
         ScriptedPool { shared: Arc::new(shared) }
     }
 
-    /// What happened to sessions, in order.
+    /// The events of all sessions, in order.
     pub fn events(&self) -> Vec<String> {
         self.shared.events.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Waits until something has happened so often.
+    /// Waits until an event has happened `count` times.
     pub async fn seen(&self, event: &str, count: usize) {
         let find = || self.events().iter().filter(|one| *one == event).count();
         let wait = async {
@@ -101,7 +101,7 @@ impl ScriptedPool {
         tokio::time::timeout(Duration::from_secs(10), wait).await.expect("it happens in time");
     }
 
-    /// Lets every episode that waits go on.
+    /// Continues all waiting episodes.
     pub fn go_on(&self) {
         self.shared.may_go_on.send_replace(true);
     }
@@ -128,7 +128,7 @@ impl SessionPool for ScriptedPool {
 
     async fn acquire(&self, request: &SessionRequest) -> Result<Session<ScriptedEnvironment>> {
         if self.shared.is_empty {
-            bail!("no session of {} could be opened", request.task);
+            bail!("no session of task {} could be opened", request.task);
         }
         self.shared.note("acquired");
         let info = SessionInfo {

@@ -1,7 +1,8 @@
-//! The seam for environments: sessions of servers over zenoh, or of a script.
+//! The interface of environments: sessions of servers over zenoh, or scripted ones.
 //!
-//! The types forbid a wrong order: only what [`Environment::reset`] returns can step, and only [`Episode::finish`] gives
-//! the session back. After a fault the session is gone with the episode.
+//! The types prevent a wrong order: only the result of [`Environment::reset`] can step, and only
+//! [`Episode::finish`] returns the session. After a fault the session is lost together with the
+//! episode.
 
 use std::future::Future;
 use std::time::Duration;
@@ -17,7 +18,7 @@ pub trait Environment: Send + Sized + 'static {
     /// A running episode of this session.
     type Episode: Episode<Environment = Self>;
 
-    /// Starts an episode. A fault gives the session up.
+    /// Starts an episode. After a fault the session is lost.
     fn reset(
         self,
         reset: Reset,
@@ -26,68 +27,69 @@ pub trait Environment: Send + Sized + 'static {
 
 /// A running episode.
 pub trait Episode: Send + Sized + 'static {
-    /// The session that it owns.
+    /// The session of the episode.
     type Environment;
 
-    /// What the policy sees now.
+    /// The current observation.
     fn observation(&self) -> &Observation;
 
-    /// One control step. After a fault the episode is void.
+    /// Executes one control step. After a fault the episode is void.
     fn step(
         &mut self,
         action: &[f32],
     ) -> impl Future<Output = Result<Transition, EnvironmentFault>> + Send;
 
-    /// The server's time for the last step: physics, image and statistics. The rest of the wait was the wire.
+    /// The server's time for the last step: physics, image and statistics. The rest of the waiting
+    /// time is transport.
     fn simulator_time(&self) -> Duration;
 
-    /// Ends the episode; the session can start another one.
+    /// Ends the episode and returns the session for another one.
     fn finish(self) -> Self::Environment;
 }
 
-/// What a session must offer.
+/// The requirements for a session.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SessionRequest {
-    /// The task that will be reset.
+    /// The task to reset.
     pub task: TaskId,
-    /// Whether observations must carry the scripted expert's action.
+    /// Whether observations must include the scripted expert's action.
     pub needs_expert: bool,
 }
 
-/// Where a session is.
+/// The server of a session.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SessionInfo {
     /// The server's id.
     pub server: String,
     /// The server's simulator and its version.
     pub simulator: String,
-    /// The task that was asked for, as the server describes it.
+    /// The requested task as described by the server.
     pub task: TaskDescription,
 }
 
 /// A session in use.
 #[derive(Debug)]
 pub struct Session<E> {
-    /// Where it is.
+    /// The server of the session.
     pub info: SessionInfo,
-    /// What is reset.
+    /// The environment to reset.
     pub environment: E,
 }
 
-/// Opens sessions and keeps those that are idle.
+/// Opens sessions and keeps idle ones.
 pub trait SessionPool: Send + Sync + 'static {
-    /// What it opens.
+    /// The environments of the pool.
     type Environment: Environment;
 
-    /// Waits for a session. An error means that the run cannot go on: no server can give one.
+    /// Waits for a session. An error ends the run: no server can provide one.
     fn acquire(
         &self,
         request: &SessionRequest,
     ) -> impl Future<Output = Result<Session<Self::Environment>>> + Send;
 
-    /// Takes back the session of an episode that ended well.
+    /// Returns the session of an episode that ended without a fault.
     fn release(&self, session: Session<Self::Environment>);
 
-    /// Takes note that a session is gone, and that its server may be.
+    /// Reports that a session was lost, and its server possibly too.
     fn lost(&self, info: &SessionInfo, fault: &EnvironmentFault);
 }

@@ -1,21 +1,22 @@
-//! How a person ends a run early: Ctrl-C once to finish the running episodes, twice to drop them.
+//! Stopping a run early: press Ctrl-C once to finish the running episodes, twice to discard them.
 
 use anyhow::{Context, Result};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
 
-/// How a run is asked to end early.
+/// How a run should end early.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stop {
-    /// It is not.
+    /// It continues.
     No,
-    /// Episodes that run are finished, no more are begun.
+    /// Running episodes are finished, no new ones are started.
     Finish,
-    /// Episodes that run are dropped; what is recorded stays.
+    /// Running episodes are discarded; records are kept.
     Now,
 }
 
-/// Watches for Ctrl-C, and for the signal that supervisors send, which allows little time: it stops at once.
+/// Listens for Ctrl-C and for SIGTERM. SIGTERM stops at once, because supervisors allow little
+/// time.
 pub fn listen() -> Result<watch::Receiver<Stop>> {
     let interrupts = signal(SignalKind::interrupt()).context("cannot listen for Ctrl-C")?;
     let terminations = signal(SignalKind::terminate()).context("cannot listen for SIGTERM")?;
@@ -24,7 +25,8 @@ pub fn listen() -> Result<watch::Receiver<Stop>> {
     Ok(receiver)
 }
 
-/// Waits until a run is asked to end this early or earlier; for ever where nobody can ask any more.
+/// Waits until a stop of at least this urgency is requested; waits forever if nothing can request
+/// one any more.
 pub async fn asked(mut stop: watch::Receiver<Stop>, at_least: Stop) {
     if stop.wait_for(|stop| *stop >= at_least).await.is_err() {
         std::future::pending().await
@@ -41,7 +43,7 @@ async fn forward(mut interrupts: Signal, mut terminations: Signal, stop: watch::
             _ = terminations.recv() => Stop::Now,
         };
         if next == Stop::Finish {
-            eprintln!("finishing the episodes that are running; press Ctrl-C again to drop them");
+            eprintln!("finishing the running episodes; press Ctrl-C again to discard them");
         }
         stop.send_replace(next);
     }

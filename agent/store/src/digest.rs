@@ -1,22 +1,24 @@
-//! The digest of what episodes did, to compare builds, machines and record formats.
+//! The digest of episodes, to compare builds, machines and record formats.
 //!
-//! It is over what was asked and what happened: identities without the run's name, tokens of all candidates, choices,
-//! statistics and states; not over times, scores, versions or the order of the records. Two sets of episodes with equal
-//! digests did the same, whatever wrote their records.
+//! It covers the request and the events of an episode: its identity without the run's name, the
+//! tokens of all candidates, choices, statistics and states. It does not cover times, scores,
+//! versions or the order of records. Sets of episodes with equal digests had the same course,
+//! independent of what wrote their records.
 
 use protocol::Statistics;
 use sha2::{Digest, Sha256};
 
 use crate::record::{EpisodeIdentity, EpisodeRecord};
 
-/// The digest of a set of episodes from their own digests, hexadecimal, so that no more than one record need be in memory at once.
+/// The digest of a set of episodes, in hexadecimal. It is computed from the episodes' digests, so
+/// that only one record must be in memory at a time.
 pub fn combined_digest(mut episodes: Vec<[u8; 32]>) -> String {
     episodes.sort_unstable();
     hex(&Sha256::digest(episodes.concat()))
 }
 
-/// The digest of one episode. Numbers are little endian; texts and lists begin with their length in 4 bytes, options with a
-/// byte that is 0 or 1.
+/// The digest of one episode. Numbers are little endian. Texts and lists start with their length in
+/// 4 bytes, options with a byte that is 0 or 1.
 pub fn episode_digest(record: &EpisodeRecord) -> [u8; 32] {
     let mut hash = Sha256::new();
     add_identity(&mut hash, &record.identity);
@@ -43,13 +45,13 @@ pub fn episode_digest(record: &EpisodeRecord) -> [u8; 32] {
     hash.finalize().into()
 }
 
-/// Bytes as lower-case hexadecimal digits.
+/// The bytes in lower-case hexadecimal.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 fn add_identity(hash: &mut Sha256, identity: &EpisodeIdentity) {
-    // Each field is named, so that a new one is not forgotten.
+    // Destructured, so that the compiler reports a new field.
     let EpisodeIdentity { run: _, task, variant, layout, episode, seed, sampling_seed, .. } =
         identity;
     let EpisodeIdentity { strategy, candidates, temperature, .. } = identity;
@@ -113,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn order_times_scores_versions_and_the_name_of_the_run_do_not_count() {
+    fn order_times_scores_versions_and_the_name_of_the_run_do_not_matter() {
         let expected = digest([&made_up(0), &made_up(1)]);
         assert_eq!(digest([&made_up(1), &made_up(0)]), expected);
         let mut other = made_up(1);
@@ -126,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_an_episode_did_counts() {
+    fn everything_that_happened_in_an_episode_matters() {
         let check = |change: fn(&mut EpisodeRecord)| {
             let mut record = made_up(1);
             change(&mut record);
@@ -156,6 +158,6 @@ mod tests {
         });
     }
 
-    /// Computed independently in Python, with `struct.pack` and `hashlib`, from the layout above.
+    /// Computed independently in Python with `struct.pack` and `hashlib` from the layout above.
     const EPISODE_3: &str = "bd4c4bb66dcc2d2fb297286d6c13d7adde9762001ed39f38c0eb77dd6b432b0c";
 }

@@ -1,4 +1,5 @@
-//! Files that are whole or absent after any interruption, and whether one can be written at all.
+//! Atomic file writes: after any interruption a file is complete or absent. Also checks in advance
+//! whether a file can be written.
 
 use std::fs::{File, OpenOptions, Permissions};
 use std::io::Write;
@@ -7,13 +8,13 @@ use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
 
-/// What unfinished files begin with: they may be removed by whoever holds the folder's lock.
+/// Prefix of unfinished files; the holder of the folder's lock may remove them.
 pub(crate) const TEMPORARY_PREFIX: &str = ".tmp";
 
-/// What must be free on the volume of a file that will be written later.
+/// Free space required for a file that will be written later, in bytes.
 const FREE_BYTES_MIN: usize = 1 << 20;
 
-/// Writes a file under a temporary name, makes it durable, then gives it its name.
+/// Writes a file under a temporary name, syncs it, then renames it.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     let name = path.display();
     let folder = folder_of(path);
@@ -22,18 +23,18 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
         .and_then(|()| file.as_file().sync_all())
         .with_context(|| format!("cannot write {name}"))?;
     file.persist(path).with_context(|| format!("cannot write {name}"))?;
-    // The name itself is durable only when its folder is.
+    // The name is durable only after its folder is synced.
     File::open(folder)
         .and_then(|folder| folder.sync_all())
         .with_context(|| format!("cannot write {name}"))
 }
 
-/// Whether a file can be written or replaced at `path`, before the work is done whose result it will hold. Makes the folder;
-/// leaves the file as it is.
+/// Checks whether a file can be written or replaced at `path`, before the work that produces its
+/// content. Creates the folder; does not change an existing file.
 pub fn check_writable(path: &Path) -> Result<()> {
     let (name, folder) = (path.display(), folder_of(path));
     std::fs::create_dir_all(folder)
-        .with_context(|| format!("cannot write {name}: cannot make its folder"))?;
+        .with_context(|| format!("cannot write {name}: cannot create its folder"))?;
     if path.exists() {
         ensure!(path.is_file(), "cannot write {name}: it exists and is not a file");
         OpenOptions::new()
@@ -41,14 +42,14 @@ pub fn check_writable(path: &Path) -> Result<()> {
             .open(path)
             .with_context(|| format!("cannot write {name}"))?;
     }
-    // Permissions and free space are known for sure only by trying.
+    // Permissions and free space can be determined reliably only by trying.
     let mut file = temporary(folder).with_context(|| format!("cannot write {name}"))?;
-    file.write_all(&vec![0; FREE_BYTES_MIN])
-        .and_then(|()| file.as_file().sync_all())
-        .with_context(|| format!("cannot write {name}: expected {FREE_BYTES_MIN} free bytes"))
+    file.write_all(&vec![0; FREE_BYTES_MIN]).and_then(|()| file.as_file().sync_all()).with_context(
+        || format!("cannot write {name}: expected at least {FREE_BYTES_MIN} free bytes"),
+    )
 }
 
-/// Others may read what is written, as far as the umask lets them: runs lie on shared volumes.
+/// The file's permissions follow the umask, because runs may be on shared volumes.
 fn temporary(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
     tempfile::Builder::new()
         .prefix(TEMPORARY_PREFIX)
@@ -56,7 +57,7 @@ fn temporary(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
         .tempfile_in(folder)
 }
 
-/// A bare file name lies in the working folder.
+/// A bare file name is in the working folder.
 fn folder_of(path: &Path) -> &Path {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
     folder.unwrap_or(Path::new("."))
@@ -67,7 +68,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_writable_place_is_left_as_it_was() {
+    fn checking_a_writable_path_changes_nothing() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("deep/results.json");
         check_writable(&path).expect("writable");
@@ -80,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_is_refused_by_name() {
+    fn an_error_names_the_path_that_cannot_be_written() {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join("file"), b"").expect("a file");
         let check = |path: &Path, expected: &str| {
@@ -89,7 +90,7 @@ mod tests {
             assert!(error.contains(&path.display().to_string()), "{error}");
         };
         check(folder.path(), "it exists and is not a file");
-        check(&folder.path().join("file/results.json"), "cannot make its folder");
+        check(&folder.path().join("file/results.json"), "cannot create its folder");
         check(Path::new("/dev/full"), "it exists and is not a file");
         check(Path::new("/proc/results.json"), "cannot write /proc/results.json");
     }

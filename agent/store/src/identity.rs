@@ -1,4 +1,4 @@
-//! What tells one episode from every other, and its name in files and links.
+//! The identity of an episode, and its name in files and links.
 
 use std::fmt::Write;
 
@@ -7,28 +7,29 @@ use decision::{Setting, Strategy, TaskId};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-/// A longer name would not be a file's name together with the suffixes that it gets.
+/// Longer names would exceed the limit of file names once suffixes are added.
 const ID_BYTES_MAX: usize = 200;
 
-/// Everything that an episode's course depends on is in here or in [`Versions`](crate::record::Versions).
+/// Everything that determines the course of an episode is here or in
+/// [`Versions`](crate::record::Versions).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EpisodeIdentity {
-    /// The run that it belongs to.
+    /// The run of the episode.
     pub run: String,
     /// The task's name.
     pub task: String,
     /// The task's variant.
     pub variant: String,
-    /// One of the task's fixed initial layouts, or none for a random one drawn from `seed`.
+    /// Number of the task's fixed initial layout; `None` for a random one generated from `seed`.
     pub layout: Option<u32>,
-    /// Number within task and variant; equal numbers of one run are paired.
+    /// Number within task and variant. Equal numbers in one run are paired.
     pub episode: u32,
-    /// The environment's seed.
+    /// Seed of the environment.
     pub seed: u64,
-    /// The policy's seed, the same for every strategy.
+    /// Seed of the policy's sampling, the same for every strategy.
     pub sampling_seed: u64,
-    /// How candidates were chosen.
+    /// The strategy that selected the candidates.
     pub strategy: String,
     /// Candidates per step.
     pub candidates: u32,
@@ -37,9 +38,10 @@ pub struct EpisodeIdentity {
 }
 
 impl EpisodeIdentity {
-    /// The episode's name within its run: a file name and a part of a link, so only `a-z A-Z 0-9 . _ - ~` stand in it.
-    /// Different episodes of a run have different names. Bytes of a task or variant other than `a-z A-Z 0-9 . _` are
-    /// written as `~` and two hexadecimal digits, since `-` separates the parts.
+    /// The episode's name within its run. It is a file name and part of a link, so it contains only
+    /// `a-z A-Z 0-9 . _ - ~`. Different episodes of a run have different names. Bytes of a task or
+    /// variant other than `a-z A-Z 0-9 . _` are written as `~` and two hexadecimal digits, because
+    /// `-` separates the parts.
     pub fn id(&self) -> String {
         let id = format!(
             "{}-{}-{:04}-{}-n{}-t{}",
@@ -53,24 +55,25 @@ impl EpisodeIdentity {
         if id.len() <= ID_BYTES_MAX {
             return id;
         }
-        // No escaped text has two `~` in a row, so a shortened name equals no other one.
+        // No escaped text contains `~~`, so a shortened name never equals another one.
         let digest = crate::digest::hex(&Sha256::digest(&id)[..16]);
         format!("{}~~{digest}", &id[..ID_BYTES_MAX - 34])
     }
 
-    /// How it was run.
+    /// The setting of the episode.
     pub fn setting(&self) -> Result<Setting> {
         let strategy: Strategy = self.strategy.parse()?;
         Ok(Setting { strategy, candidates: self.candidates, temperature: self.temperature })
     }
 
-    /// What was to be done.
+    /// The task of the episode.
     pub fn task_id(&self) -> TaskId {
         TaskId::new(&self.task, &self.variant)
     }
 }
 
-/// ASCII letters, digits, `_`, `.` except as the first, and what `also` names stand for themselves.
+/// Keeps ASCII letters, digits, `_`, any `.` but a leading one, and the characters in `also`;
+/// escapes the rest.
 fn escaped(text: &str, also: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for (index, byte) in text.bytes().enumerate() {
@@ -110,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_bridge_tasks_are_what_they_were() {
+    fn names_of_bridge_tasks_do_not_change() {
         let check = |strategy, expected: &str| {
             let named = id("widowx_stack_cube", "default", strategy);
             assert_eq!(named, format!("widowx_stack_cube-default-0007-{expected}-n5-t0.7"));
@@ -121,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_file_names_and_different_for_different_episodes() {
+    fn names_are_valid_file_names_and_unique() {
         let long = "x".repeat(128);
         let texts = [
             "ALE/Pong-v5",

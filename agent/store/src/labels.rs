@@ -1,8 +1,8 @@
-//! The label store: one row per recorded episode of any run, from which verifiers are trained.
+//! The label store: one row per recorded episode of any run. Verifiers are trained from it.
 //!
-//! A row names its record and holds every field that decides whether the episode may be trained on: layout, seed, strategy,
-//! temperature, policy. Rows come from records alone, each in the transaction that puts its record into the run's index;
-//! what others publish is never read here.
+//! A row names its record and contains every field that determines whether the episode may be used
+//! for training: layout, seed, strategy, temperature, policy. Rows come only from records, each in
+//! the transaction that adds its record to the run's index. Published outcomes are never read here.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -15,9 +15,9 @@ use rusqlite::{Connection, OpenFlags, OptionalExtension, Row, params};
 use crate::durable::check_writable;
 use crate::record::EpisodeRecord;
 
-/// Version of the table; a store of another version is refused.
+/// Version of the schema; a store of another version is refused.
 const STORE_VERSION: i64 = 2;
-/// How long a writer waits for another one.
+/// How long a writer waits for another writer.
 pub(crate) const WAIT: Duration = Duration::from_secs(30);
 
 /// An open label store. Several processes may write one store.
@@ -32,9 +32,9 @@ pub struct LabelStore {
 pub struct Label {
     /// The episode's name within its run.
     pub id: String,
-    /// What happened in it.
+    /// The outcome of the episode.
     pub outcome: EpisodeOutcome,
-    /// Where its record is; none when that is on another machine.
+    /// Path of its record; `None` if the record is on another machine.
     pub record: Option<PathBuf>,
 }
 
@@ -46,7 +46,7 @@ impl Label {
     }
 }
 
-/// What is published of a record.
+/// The outcome that is published for a record.
 pub fn outcome(record: &EpisodeRecord) -> EpisodeOutcome {
     let (identity, versions) = (&record.identity, &record.versions);
     EpisodeOutcome {
@@ -69,14 +69,15 @@ pub fn outcome(record: &EpisodeRecord) -> EpisodeOutcome {
 }
 
 impl LabelStore {
-    /// Opens the store for writing, making it when there is none. Fails at once where labels could not be written later.
+    /// Opens the store for writing and creates it if necessary. Fails at once if labels could not
+    /// be written later.
     pub fn open(path: &Path) -> Result<LabelStore> {
         let name = path.display();
         check_writable(path).with_context(|| format!("cannot open the label store {name}"))?;
         let connection = Connection::open(path)
             .with_context(|| format!("cannot open the label store {name}"))?;
         connection.busy_timeout(WAIT)?;
-        // A store that is made has none yet.
+        // A new store has version 0.
         ensure_version(&connection, path, &[STORE_VERSION, 0])?;
         ensure_whole(&connection, path)?;
         connection
@@ -85,7 +86,7 @@ impl LabelStore {
         Ok(LabelStore { connection, path: path.to_path_buf() })
     }
 
-    /// Keeps a label; true when its episode had none.
+    /// Stores a label; true if the episode had none.
     pub fn insert(&self, label: &Label) -> Result<bool> {
         let write = || -> Result<bool> {
             let is_new = !contains(&self.connection, &label.outcome.run, &label.id)?;
@@ -96,7 +97,7 @@ impl LabelStore {
     }
 }
 
-/// All labels of a store that may be read only, ordered by run and name.
+/// All labels of a store, ordered by run and name. Opens the store read-only.
 pub fn labels(path: &Path) -> Result<Vec<Label>> {
     let name = path.display();
     ensure!(path.is_file(), "label store {name}: expected a file, got none");
@@ -117,25 +118,25 @@ fn ensure_version(connection: &Connection, path: &Path, expected: &[i64]) -> Res
         .with_context(|| format!("{name} is not a label store"))?;
     ensure!(
         expected.contains(&version),
-        "label store {name}: expected version {STORE_VERSION}, got {version}; use another file"
+        "label store {name}: expected version {STORE_VERSION}, got {version}; choose another file"
     );
     Ok(())
 }
 
-/// Labels can be made again, but only by the runs that they come from.
+/// Labels can be restored, but only by rerunning the commands of their runs.
 fn ensure_whole(connection: &Connection, path: &Path) -> Result<()> {
     let found: rusqlite::Result<String> =
         connection.query_row("PRAGMA quick_check(1)", [], |row| row.get(0));
     let found = found.unwrap_or_else(|error| error.to_string());
     ensure!(
         found == "ok",
-        "label store {}: damaged: {found}; move it away and rerun the commands whose labels it held",
+        "label store {}: damaged: {found}; move the file away and rerun the commands that wrote its labels",
         path.display()
     );
     Ok(())
 }
 
-/// Writes a label to the store that is open or attached, in place of what it said before.
+/// Writes a label to the open or attached store, replacing an earlier one.
 pub(crate) fn insert(connection: &Connection, label: &Label) -> rusqlite::Result<()> {
     let (outcome, statistics) = (&label.outcome, &label.outcome.statistics);
     let record = label.record.as_ref().map(|path| path.to_string_lossy().into_owned());
@@ -169,16 +170,16 @@ pub(crate) fn insert(connection: &Connection, label: &Label) -> rusqlite::Result
     Ok(())
 }
 
-/// What a store was made to say of one run.
+/// The changes that reconciling made for one run.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Corrections {
-    /// Labels that said something else than their records.
+    /// Number of labels that differed from their records.
     pub changed: usize,
-    /// Labels without a record.
+    /// Number of labels without a record.
     pub removed: usize,
 }
 
-/// Makes the attached store say of `run` what its records say, which are in `folder`.
+/// Makes the labels of `run` in the attached store equal to its records, which are in `folder`.
 pub(crate) fn reconcile(
     connection: &Connection,
     run: &str,
@@ -191,7 +192,7 @@ pub(crate) fn reconcile(
     let mut one = connection.prepare("SELECT * FROM labels WHERE run = ?1 AND id = ?2")?;
     let mut found = BTreeMap::new();
     for id in ids {
-        // A row that cannot be read is none that could be right.
+        // A row that cannot be read is wrong in any case.
         let label = one.query_row([run, &id], read).ok();
         found.insert(id, label);
     }
@@ -208,7 +209,7 @@ pub(crate) fn reconcile(
     }
     for (id, label) in found {
         let record = label.and_then(|label| label.record);
-        // A copy of the run in another folder may have gone on by itself.
+        // A copy of the run in another folder may have been resumed independently.
         if record.is_none_or(|record| record.starts_with(folder)) {
             connection.execute("DELETE FROM labels WHERE run = ?1 AND id = ?2", [run, &id])?;
             corrections.removed += 1;
@@ -226,7 +227,8 @@ fn contains(connection: &Connection, run: &str, id: &str) -> rusqlite::Result<bo
 const INSERT: &str = "INSERT OR REPLACE INTO labels VALUES
     (?1,?2,?3,?4,?5,?6,?7,?8,?9,?10,?11,?12,?13,?14,?15,?16,?17,?18,?19,?20,?21,?22,?23,?24,?25)";
 
-/// A rollback journal, for a write-ahead log works on one host only, and for transactions over two files.
+/// Uses a rollback journal: a write-ahead log works on one host only and has no transactions over
+/// two files.
 const SCHEMA: &str = "
     PRAGMA journal_mode = DELETE;
     BEGIN IMMEDIATE;
@@ -284,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_label_is_read_back_whole_and_its_episode_has_one_row() {
+    fn a_label_is_read_back_unchanged_and_an_episode_has_one_row() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("deep/labels.sqlite");
         let store = LabelStore::open(&path).expect("a store");
@@ -300,11 +302,12 @@ mod tests {
     }
 
     #[test]
-    fn a_store_is_made_to_say_what_the_records_of_a_run_say() {
+    fn labels_are_made_equal_to_the_records_of_a_run() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("labels.sqlite");
         let store = LabelStore::open(&path).expect("a store");
-        // Forged, of an episode without a record, of another run, of a copy of the run, and with a moved record.
+        // A forged label, one without a record, one of another run, one of a copy of the run, and
+        // one with a moved record.
         let mut forged = label(0);
         forged.outcome.statistics.is_success = false;
         let mut other_run = label(0);
@@ -325,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_label_store_is_refused_by_name() {
+    fn a_file_that_is_not_a_label_store_is_refused_by_name() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("labels.sqlite");
         let check = |path: &Path, expected: &str| {
@@ -350,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_store_is_said_before_anything_is_written() {
+    fn a_damaged_store_is_reported_before_anything_is_written() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("labels.sqlite");
         let store = LabelStore::open(&path).expect("a store");

@@ -1,17 +1,17 @@
-//! What is kept of episodes, and what is still to be run.
+//! Stores episodes and runs, and queues the episodes that are still to be run.
 //!
 //! ```text
-//! EpisodePlan x Setting ─▶ EpisodeQueue ─▶ (runtime) ─▶ EpisodeRecord ─▶ Run: record file, then index and label together
+//! EpisodePlan x Setting ─▶ EpisodeQueue ─▶ (runtime) ─▶ EpisodeRecord ─▶ Run: record, index, label
 //! ```
 //!
-//! The records are the truth: index, labels, tables and videos can be rebuilt from them. There is no record of an episode
-//! that broke: a fault leaves nothing behind that could become a label.
+//! The records are the source of truth: index, labels, tables and videos can be rebuilt from them.
+//! An episode that ends in a fault has no record, so that a fault never becomes a label.
 
-// What is still to be run.
+// Episodes to run.
 pub mod plan;
 pub mod queue;
 
-// What is kept.
+// Stored data.
 mod identity;
 pub mod labels;
 pub mod provenance;
@@ -19,7 +19,7 @@ pub mod record;
 pub mod run;
 pub mod video;
 
-// How it is kept, and how it is compared.
+// Writing and comparing files.
 mod digest;
 mod durable;
 

@@ -1,57 +1,58 @@
-//! Planned episodes, and what their seeds may be used for.
+//! Planned episodes and the use of their seeds.
 
 use decision::TaskId;
 
-/// Seeds of one range; no two ranges share a seed.
+/// Number of seeds per range; ranges are disjoint.
 pub const SEEDS_PER_RANGE: u64 = 1_000_000_000;
 
-/// What a seed may be used for. Demonstrations, collected labels and evaluation never share an initial layout.
+/// The use of a seed. Demonstrations, collected labels and evaluation never share an initial
+/// layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SeedRange {
-    /// The expert's demonstrations that generators are trained on.
+    /// The expert's demonstrations, on which generators are trained.
     Demonstrations,
-    /// Rollouts that verifiers are trained on.
+    /// Rollouts on which verifiers are trained.
     Collection,
-    /// Choosing between settings.
+    /// Comparing settings.
     Tuning,
-    /// Held out: results only.
+    /// Held out for results only.
     Evaluation,
 }
 
 impl SeedRange {
-    /// The range's first seed.
+    /// The first seed of the range.
     pub fn first(self) -> u64 {
         self as u64 * SEEDS_PER_RANGE
     }
 
-    /// Whether a seed lies in this range.
+    /// Whether the range contains a seed.
     pub fn contains(self, seed: u64) -> bool {
         (self.first()..self.first() + SEEDS_PER_RANGE).contains(&seed)
     }
 }
 
-/// A task that servers offer, in one variant.
+/// A task in one variant that servers offer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OfferedTask {
     /// The task and its variant.
     pub id: TaskId,
-    /// How many fixed initial layouts it has.
+    /// Number of its fixed initial layouts.
     pub layouts: u32,
     /// Control steps after which an episode is truncated.
     pub steps_max: u32,
 }
 
-/// One episode to be run, not yet tied to a setting.
+/// An episode to run, not yet combined with a setting.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EpisodePlan {
     /// The task and its variant.
     pub task: TaskId,
-    /// One of the task's fixed initial layouts, or none for a random one.
+    /// Number of the task's fixed initial layout; `None` for a random one.
     pub layout: Option<u32>,
     /// Number within task and variant.
     pub episode: u32,
-    /// The environment's seed.
+    /// Seed of the environment.
     pub seed: u64,
-    /// The policy's seed.
+    /// Seed of the policy's sampling.
     pub sampling_seed: u64,
 }

@@ -1,41 +1,43 @@
-//! How records came about: by which build, with which command and options.
+//! The provenance of records: build, command and options.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// How a record came about. Every record's file holds it, so that a record explains itself wherever it is copied to.
+/// The provenance of a record. Every record file contains it, so that a copied file is
+/// self-describing.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// The command line, word by word.
     pub command: Vec<String>,
-    /// Everything that decides the results, by name.
+    /// Everything that determines the results, by name.
     pub options: Value,
     /// The program.
     pub build: Build,
 }
 
-/// Follows a commit from which files differed.
+/// Suffix of a commit whose files were modified.
 const DIRTY: &str = "-dirty";
 
-/// A build of the program; all fields are empty where the caller does not know its own.
+/// A build of the program. All fields are empty if the caller does not know its build.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Build {
-    /// Of the program.
+    /// Version of the program.
     pub version: String,
-    /// The commit that was checked out, hexadecimal; empty for a build outside a repository.
+    /// The checked-out commit in hexadecimal; empty for a build outside a repository.
     pub commit: String,
-    /// Whether something differed from that commit.
+    /// Whether files differed from that commit.
     pub is_dirty: bool,
     /// When it was built, RFC 3339.
     pub date: String,
 }
 
 impl Build {
-    /// Of a version, a commit as `git describe --always --dirty` writes it, and a date.
+    /// A build from a version, a commit in the format of `git describe --always --dirty`, and a
+    /// date.
     pub fn new(version: &str, described: &str, date: &str) -> Build {
         let (commit, is_dirty) = match described.strip_suffix(DIRTY) {
             Some(commit) => (commit, true),
@@ -49,14 +51,14 @@ impl Build {
         }
     }
 
-    /// The commit, with `-dirty` when something differed from it.
+    /// The commit, with the suffix `-dirty` if files differed from it.
     pub fn commit_text(&self) -> String {
         let commit = if self.commit.is_empty() { "unknown" } else { &self.commit };
         format!("{commit}{}", if self.is_dirty { DIRTY } else { "" })
     }
 
-    /// Whether both are known to be built from the same sources. Two builds from a changed commit may differ in anything, so
-    /// only a build itself is the same as one of those.
+    /// Whether both builds are known to have the same sources. Builds from modified commits may
+    /// differ arbitrarily, so such a build equals only itself.
     pub fn has_sources_of(&self, other: &Build) -> bool {
         let is_clean = |build: &Build| !build.commit.is_empty() && !build.is_dirty;
         self == other || (is_clean(self) && is_clean(other) && self.commit == other.commit)

@@ -1,8 +1,9 @@
-//! The queue of episodes that are still to be run: leases, attempts, and what is given up.
+//! The queue of episodes to run: leases, attempts, and episodes that are given up.
 //!
-//! A worker leases an episode, renews its lease while the episode runs, and in the end completes it, fails it, or releases it
-//! unbegun. Only an implementation knows who holds a lease and when one expires: the queue of a run folder lives as long as
-//! its process, the queue of a fleet outlives its workers.
+//! A worker leases an episode, renews the lease while the episode runs, and finally completes it,
+//! fails it, or releases it without starting it. Only an implementation knows who holds a lease and
+//! when it expires: the queue of a run folder exists as long as its process, the queue of a fleet
+//! outlives its workers.
 
 mod run_queue;
 #[cfg(any(test, feature = "scripted"))]
@@ -21,103 +22,108 @@ pub use scripted::{QueueEvent, ScriptedQueue};
 
 use crate::record::EpisodeIdentity;
 
-/// Faults of an episode itself after which it is given up: what fails every time is no accident.
+/// An episode is given up after this number of its own faults, because repeated faults are not
+/// accidental.
 pub const ATTEMPTS_MAX: u32 = 3;
 
-/// Interruptions by servers and links after which an episode is given up all the same, so that one that brings down every
-/// server which runs it does not hold up a run for ever.
+/// An episode is given up after this number of interruptions by servers and links. An episode that
+/// crashes every server must not block a run forever.
 pub const INTERRUPTIONS_MAX: u32 = 20;
 
-/// Where planned episodes come from, and where it is noted how they ended. Every error is the queue's own.
+/// Provides planned episodes and records how they ended. Every error is an error of the queue
+/// itself.
 #[async_trait]
 pub trait EpisodeQueue: Send + Sync {
-    /// Leases the next episode; none when nothing waits now. Leased episodes may come back, so a queue is only finished
-    /// when [`QueueProgress::is_finished`].
+    /// Leases the next episode, or returns `None` if no episode is waiting now. Leased episodes may
+    /// return to the queue, so it is finished only when [`QueueProgress::is_finished`].
     async fn lease(&self) -> Result<Option<Lease>>;
 
-    /// Extends a lease; false when it is no longer held, and then its episode must be abandoned without a record.
+    /// Extends a lease. False if it is no longer held: its episode must then be abandoned without a
+    /// record.
     async fn renew(&self, lease: &Lease) -> Result<bool>;
 
-    /// The episode ran to its end and its record is durable.
+    /// The episode has ended and its record is durable.
     async fn complete(&self, lease: Lease) -> Result<()>;
 
-    /// The episode broke. It is run again after all that wait, or given up.
+    /// The episode failed. It is requeued after all waiting episodes, or given up.
     async fn fail(&self, lease: Lease, scope: FaultScope, reason: &str) -> Result<Disposition>;
 
-    /// The episode could not be begun: it is the next one again, and no attempt is lost.
+    /// The episode could not be started: it becomes the next one again, without using up an
+    /// attempt.
     async fn release(&self, lease: Lease) -> Result<()>;
 
-    /// How many episodes are in which state.
+    /// The number of episodes in each state.
     async fn progress(&self) -> Result<QueueProgress>;
 
-    /// Episodes that will not be run again, with every reason, in the order in which they were given up.
+    /// Episodes that will not be run again, with all reasons, in the order in which they were given
+    /// up.
     async fn given_up(&self) -> Result<Vec<GivenUp>>;
 }
 
-/// One episode to be run with one setting.
+/// One episode to run with one setting.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Job {
-    /// Which episode, and how.
+    /// The episode and its setting.
     pub identity: EpisodeIdentity,
-    /// The same as in the identity, parsed.
+    /// The setting of the identity, parsed.
     pub setting: Setting,
     /// 1 for the first attempt; interruptions do not count.
     pub attempt: u32,
 }
 
-/// The right to run one episode now. It is given back by [`EpisodeQueue::complete`], [`fail`](EpisodeQueue::fail) or
-/// [`release`](EpisodeQueue::release).
+/// The right to run one episode now. It ends with [`EpisodeQueue::complete`],
+/// [`fail`](EpisodeQueue::fail) or [`release`](EpisodeQueue::release).
 #[derive(Debug, PartialEq)]
 pub struct Lease {
-    /// What is to be run.
+    /// The episode to run.
     pub job: Job,
-    /// Tells this lease from every other of its queue, an earlier one of the same episode included.
+    /// Identifies this lease, also among several leases of the same episode.
     token: u64,
 }
 
-/// What a fault says about the episode in which it happened.
+/// What a fault affects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FaultScope {
-    /// The episode: diverged physics, a policy or a scorer that fails on it.
+    /// The episode: for example diverged physics, or a policy or scorer that fails on it.
     Episode,
-    /// Its server: crashed, frozen, or not doing what it says of itself.
+    /// Its server: crashed, frozen, or not matching its description.
     Server,
     /// The network between this process and the server.
     Link,
 }
 
 impl FaultScope {
-    /// Whether such a fault uses up one of the episode's attempts.
+    /// Whether such a fault uses up an attempt of the episode.
     pub fn counts_as_attempt(self) -> bool {
         self == FaultScope::Episode
     }
 }
 
-/// What becomes of an episode that broke.
+/// What happens to an episode that failed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Disposition {
     /// It will be run again.
     Requeued,
-    /// It will not.
+    /// It will not be run again.
     GivenUp,
 }
 
-/// How many episodes are in which state.
+/// The number of episodes in each state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct QueueProgress {
-    /// Not leased, to be run.
+    /// Waiting to be run.
     pub waiting: usize,
-    /// Being run, here or elsewhere.
+    /// Running, here or elsewhere.
     pub leased: usize,
-    /// With a record, those from before this process started included.
+    /// Recorded, including those recorded before this process started.
     pub completed: usize,
-    /// Not to be run again by this queue.
+    /// Not run again by this queue.
     pub given_up: usize,
 }
 
 impl QueueProgress {
-    /// Whether nothing is left to be run.
+    /// Whether no episode is left to run.
     pub fn is_finished(&self) -> bool {
         self.waiting == 0 && self.leased == 0
     }
@@ -133,12 +139,12 @@ impl QueueProgress {
     }
 }
 
-/// An episode that is not run again, and why.
+/// An episode that is not run again, with the reasons.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GivenUp {
     /// Which episode.
     pub identity: EpisodeIdentity,
-    /// What happened each time, first to last.
+    /// The reason of each fault, first to last.
     pub reasons: Vec<String>,
 }
 

@@ -1,7 +1,7 @@
-//! The record of one finished episode: everything that tables, labels, videos and reports are rebuilt from.
+//! The record of one finished episode, from which tables, labels, videos and reports are rebuilt.
 //!
-//! A record is one MessagePack file (maps with string keys), written at once when the episode ends. There is no record of
-//! an episode that broke: a fault leaves nothing behind that could become a label.
+//! A record is one MessagePack file (maps with string keys), written when the episode ends. An
+//! episode that ends in a fault has no record, so that a fault never becomes a label.
 
 mod file;
 
@@ -17,43 +17,44 @@ pub use file::{ReadError, RecordFile};
 /// Version of the format; a record of another version is refused.
 pub const RECORD_VERSION: u32 = 4;
 
-/// What is known of a finished episode.
+/// The data of a finished episode.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EpisodeRecord {
     /// [`RECORD_VERSION`].
     pub version: u32,
-    /// Which episode this is.
+    /// The identity of the episode.
     pub identity: EpisodeIdentity,
-    /// What it was run with.
+    /// The versions that it was run with.
     pub versions: Versions,
-    /// The instruction as the policy read it.
+    /// The instruction as given to the policy.
     pub instruction: String,
-    /// The task's horizon: control steps after which an episode is truncated.
+    /// Horizon: an episode is truncated after so many control steps.
     pub steps_max: u32,
-    /// As of the last step; success is read here.
+    /// The statistics at the last step, including the success.
     pub statistics: Statistics,
     /// One entry per control step, in order.
     pub steps: Vec<StepRecord>,
-    /// Seconds from the reset to the last step; episodes share the machine with others.
+    /// Seconds from the reset to the last step; other episodes run on the machine at the same time.
     pub wall_secs: f32,
 }
 
-/// Versions of everything that an episode depends on.
+/// Versions of everything that affects an episode.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Versions {
-    /// Of the program.
+    /// Version of the program.
     pub rever: String,
-    /// The commit that the program was built from, as [`Build::commit_text`](crate::provenance::Build::commit_text) writes it.
+    /// The commit of the build, formatted by
+    /// [`Build::commit_text`](crate::provenance::Build::commit_text).
     pub commit: String,
-    /// Of the protocol.
+    /// Version of the protocol.
     pub protocol: u32,
     /// The server's simulator and its version.
     pub simulator: String,
-    /// Digest of the policy's weights and configuration, hexadecimal.
+    /// Digest of the policy's weights and configuration, in hexadecimal.
     pub policy: String,
-    /// Digest of the verifier that scored, hexadecimal.
+    /// Digest of the verifier that scored the candidates, in hexadecimal.
     pub verifier: Option<String>,
 }
 
@@ -61,18 +62,18 @@ pub struct Versions {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StepRecord {
-    /// What the robot felt before, as the task's description says. In a Bridge task: x y z (m), roll pitch yaw (rad), 0,
-    /// gripper opening.
+    /// The robot's state before the step, with the dimensions in the task's description. For a
+    /// Bridge task: x, y, z (m), roll, pitch, yaw (rad), 0, gripper opening.
     pub state: Vec<f32>,
-    /// What was decided here; none for a step that executes a further action of the chunk decided before.
+    /// The decision at this step; `None` if the step executes a further action of an earlier chunk.
     pub decision: Option<DecisionRecord>,
-    /// What was executed.
+    /// The executed action.
     pub action: Action,
-    /// After this step.
+    /// The statistics after this step.
     pub statistics: Statistics,
-    /// From the action to the next observation.
+    /// Time from the action to the next observation.
     pub step_ms: f32,
-    /// Of `step_ms`, the server's time for physics, image and statistics.
+    /// The part of `step_ms` that the server spent on physics, image and statistics.
     pub simulator_ms: f32,
 }
 
@@ -80,33 +81,35 @@ pub struct StepRecord {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DecisionRecord {
-    /// All that were sampled.
+    /// All sampled candidates.
     pub candidates: Vec<CandidateRecord>,
-    /// The executed one; none when no candidate was well formed and the robot held still.
+    /// Index of the executed candidate; `None` if no candidate was well formed and the robot held
+    /// still.
     pub chosen: Option<u32>,
-    /// From the observations of the batch to its chosen actions.
+    /// Time from the observations of the batch to its chosen actions.
     pub batch_ms: f32,
-    /// Decisions that were made together, this one included.
+    /// Number of decisions in the batch, including this one.
     pub batch_size: u32,
 }
 
-/// One sampled candidate. Its text is rebuilt from the tokens with the policy's tokenizer.
+/// One sampled candidate. Its text is decoded from the tokens with the policy's tokenizer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CandidateRecord {
-    /// The completion, reasoning and action.
+    /// The tokens of the completion: reasoning and action.
     pub tokens: Vec<u32>,
-    /// What it would do; none for a malformed candidate.
+    /// Its actions; `None` for a malformed candidate.
     pub actions: Option<ActionChunk>,
-    /// Why it does not parse.
+    /// The reason why it is malformed.
     pub malformed: Option<String>,
-    /// The scorer's probability of success.
+    /// The verifier's success probability.
     pub score: Option<f32>,
-    /// Of the sampled tokens at temperature 1.
+    /// Log-probability of the sampled tokens at temperature 1.
     pub log_probability: f32,
-    /// Of each token, at temperature 1.
+    /// Log-probability of each token at temperature 1.
     pub log_probabilities: Vec<f32>,
-    /// The last token's final hidden state, 16-bit floats, little endian; always there for the chosen candidate.
+    /// The last token's final hidden state as 16-bit floats in little-endian order; always present
+    /// for the executed candidate.
     #[serde(with = "serde_bytes")]
     pub hidden: Option<Vec<u8>>,
 }
@@ -119,18 +122,18 @@ impl DecisionRecord {
 }
 
 impl EpisodeRecord {
-    /// The decisions in their order.
+    /// The decisions in order.
     pub fn decisions(&self) -> impl Iterator<Item = &DecisionRecord> {
         self.steps.iter().filter_map(|step| step.decision.as_ref())
     }
 
-    /// Whether the episode has an outcome: where no candidate was ever well formed, what the robot did was not the policy's
-    /// doing.
+    /// Whether the episode has an outcome. Without any well-formed candidate the policy never
+    /// controlled the robot.
     pub fn has_outcome(&self) -> bool {
         self.decisions().any(|decision| decision.chosen.is_some())
     }
 
-    /// The mean of the chosen candidates' scores; none without a scorer or without any choice.
+    /// The mean score of the executed candidates; `None` without a verifier or without any choice.
     pub fn score_mean(&self) -> Option<f32> {
         let chosen = self
             .decisions()
@@ -141,12 +144,12 @@ impl EpisodeRecord {
     }
 }
 
-/// A hidden state as it stands in a record.
+/// Encodes a hidden state for a record.
 pub fn hidden_to_bytes(hidden: &[f32]) -> Vec<u8> {
     hidden.iter().flat_map(|value| f16::from_f32(*value).to_le_bytes()).collect()
 }
 
-/// A hidden state from a record.
+/// Decodes a hidden state of a record.
 pub fn hidden_from_bytes(bytes: &[u8]) -> Result<Vec<f32>> {
     ensure!(
         bytes.len().is_multiple_of(2),
@@ -228,7 +231,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_record_knows_its_setting_and_its_mean_score() {
+    fn a_record_has_a_setting_and_a_mean_score() {
         let record = made_up(3);
         assert_eq!(record.score_mean(), Some(0.75));
         let setting = record.identity.setting().expect("a setting");

@@ -1,4 +1,5 @@
-//! Videos of episodes: H.264 in an MP4 file that every browser plays, made while the episode runs.
+//! Videos of episodes: H.264 in an MP4 file that every browser plays, encoded while the episode
+//! runs.
 
 use anyhow::{Context, bail, ensure};
 use muxide::api::{Muxer, MuxerBuilder, VideoCodec};
@@ -9,21 +10,22 @@ use openh264::encoder::{
 };
 use openh264::formats::{RgbSliceU8, YUVBuffer};
 
-/// Frames per second: one control step lasts 1 / 5 s, so videos run at the robot's own speed.
+/// Frames per second: a control step lasts 1/5 s, so videos play in real time.
 pub const FRAMES_PER_SECOND: u32 = 5;
 
-/// H.264 halves the colour planes, so each pixel is doubled first: a box drawn around a pixel of the
-/// model's image then still lies around that pixel's colour. Costs about a third more bytes.
+/// H.264 halves the resolution of the colour planes, so each pixel is doubled first. A box drawn
+/// around a pixel of the model's image then still encloses that pixel's colour. This costs about a
+/// third more bytes.
 const SCALE: usize = 2;
 
-/// A seek decodes at most this many frames; the scrubber of the report seeks at every key press.
+/// A seek decodes at most this many frames; the report seeks at every key press.
 const KEYFRAME_EVERY: u32 = 25;
 
-/// Frames longer than this are refused: an episode has at most a few hundred steps.
+/// Maximum number of frames: an episode has at most a few hundred steps.
 const FRAMES_MAX: usize = 10_000;
 
-/// The video of one episode: frame `k` is what the policy saw before step `k`, the last frame is what
-/// the last step led to.
+/// The video of one episode: frame `k` is the policy's input at step `k`, the last frame shows the
+/// result of the last step.
 pub struct Video {
     height: usize,
     width: usize,
@@ -39,10 +41,10 @@ impl Video {
     pub fn new(height: usize, width: usize) -> anyhow::Result<Self> {
         ensure!(
             (8..=1024).contains(&height) && (8..=1024).contains(&width),
-            "a video frame has 8 to 1024 pixels each way, got {height} x {width}"
+            "video frame: expected 8 to 1024 pixels per side, got {height} x {width}"
         );
-        // Rate control is off because it would skip frames and so break "frame k is step k";
-        // the fixed quantiser keeps thin grippers sharp at some 0.5 kB per frame.
+        // Rate control is off because it would skip frames, and then frame k would not be step k.
+        // The fixed quantiser keeps thin grippers sharp at about 0.5 kB per frame.
         let options = EncoderConfig::new()
             .rate_control_mode(RateControlMode::Off)
             .skip_frames(false)
@@ -57,13 +59,13 @@ impl Video {
             .num_threads(1)
             .vui(VuiConfig::bt601());
         let encoder = Encoder::with_api_config(OpenH264API::from_source(), options)
-            .context("the H.264 encoder does not start")?;
+            .context("cannot start the H.264 encoder")?;
         let (wide, high) = ((width * SCALE) as u32, (height * SCALE) as u32);
         let muxer = MuxerBuilder::new(Vec::new())
             .video(VideoCodec::H264, wide, high, f64::from(FRAMES_PER_SECOND))
             .with_fast_start(true)
             .build()
-            .context("the video file cannot be begun")?;
+            .context("cannot start the video file")?;
         Ok(Self {
             height,
             width,
@@ -79,9 +81,9 @@ impl Video {
     pub fn push(&mut self, pixels: &[u8]) -> anyhow::Result<()> {
         let expected = self.height * self.width * 3;
         if pixels.len() != expected {
-            bail!("a video frame has {expected} bytes, got {}", pixels.len());
+            bail!("video frame: expected {expected} bytes, got {}", pixels.len());
         }
-        ensure!(self.frames < FRAMES_MAX, "a video has at most {FRAMES_MAX} frames");
+        ensure!(self.frames < FRAMES_MAX, "video: expected at most {FRAMES_MAX} frames, got more");
         self.enlarge(pixels);
         let size = (self.width * SCALE, self.height * SCALE);
         self.planes.read_rgb8(RgbSliceU8::new(&self.scaled, size));
@@ -90,19 +92,19 @@ impl Video {
         let seconds = self.frames as f64 / f64::from(FRAMES_PER_SECOND);
         self.muxer
             .write_video(seconds, &stream.to_vec(), is_keyframe)
-            .with_context(|| format!("frame {} does not go into the video file", self.frames))?;
+            .with_context(|| format!("cannot add frame {} to the video file", self.frames))?;
         self.frames += 1;
         Ok(())
     }
 
     /// The finished MP4 file.
     pub fn finish(mut self) -> anyhow::Result<Vec<u8>> {
-        ensure!(self.frames > 0, "a video has at least one frame, got none");
-        self.muxer.finish_in_place().context("the video file cannot be finished")?;
+        ensure!(self.frames > 0, "video: expected at least one frame, got none");
+        self.muxer.finish_in_place().context("cannot finish the video file")?;
         Ok(self.muxer.into_writer())
     }
 
-    /// Doubles every pixel both ways into `scaled`.
+    /// Doubles every pixel in both directions into `scaled`.
     fn enlarge(&mut self, pixels: &[u8]) {
         let wide = self.width * SCALE * 3;
         for (row, source) in pixels.chunks_exact(self.width * 3).enumerate() {
@@ -144,7 +146,8 @@ mod tests {
         video.finish().expect("file")
     }
 
-    /// Length-prefixed units of the media box as Annex B, with the parameter sets in front.
+    /// The length-prefixed units of the media box in Annex B format, preceded by the parameter
+    /// sets.
     fn stream_of(file: &[u8]) -> Vec<u8> {
         let find = |name: &[u8]| file.windows(4).position(|window| window == name);
         let configuration = find(b"avcC").expect("avcC") + 4;
@@ -167,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn every_frame_comes_back_in_order_and_in_colour() {
+    fn every_frame_is_decoded_in_order_and_in_colour() {
         use openh264::decoder::Decoder;
         use openh264::formats::YUVSource;
         let stream = stream_of(&video(60));
@@ -196,10 +199,10 @@ mod tests {
     }
 
     #[test]
-    fn wrong_frames_are_refused_in_words() {
+    fn wrong_frames_are_refused_with_a_reason() {
         let mut video = Video::new(64, 96).expect("encoder");
         let error = video.push(&[0; 12]).expect_err("short frame").to_string();
-        assert_eq!(error, "a video frame has 18432 bytes, got 12");
+        assert_eq!(error, "video frame: expected 18432 bytes, got 12");
         assert!(Video::new(4, 96).is_err());
         assert!(Video::new(64, 96).expect("encoder").finish().is_err());
     }

@@ -1,34 +1,35 @@
-//! What a verifier file says about itself: for which policy, trained how and on what, and how good it is.
+//! The metadata of a verifier file: its policy, its training and its measured quality.
 //!
-//! The aliases are the names in files of the first format, which stay readable.
+//! The serde aliases are the names in files of the first format, which can still be read.
 
 use anyhow::ensure;
 use serde::{Deserialize, Serialize};
 
 use crate::Metrics;
 
-/// Numbers of an action in files of the first format, which do not say it.
+/// Dimensions of an action in files of the first format, which do not store it.
 const ACTION_LENGTH_FIRST: usize = 7;
 
-/// Everything in a verifier file beside its weights.
+/// Everything in a verifier file except its weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VerifierDescription {
-    /// Digest of the policy whose hidden states it reads.
+    /// Digest of the policy whose hidden states the verifier reads.
     pub policy: String,
     /// Length of a hidden state.
     pub input_size: usize,
-    /// Numbers of the policy's actions.
+    /// Number of dimensions of the policy's actions.
     #[serde(default = "action_length_first")]
     pub action_length: usize,
-    /// How it was trained.
+    /// The training options.
     pub options: TrainingOptions,
-    /// What it was trained on.
+    /// The training data.
     #[serde(alias = "evidence")]
     pub data: TrainingData,
-    /// How well its network separates successes from failures on the held-out episodes, by executed candidates.
+    /// How well the network separates successes from failures of held-out episodes, for the
+    /// executed candidates.
     pub held_out: Metrics,
-    /// What its ranking was fitted to; none when it has no ranking.
+    /// The data and the gain of the ranking; `None` if there is no ranking.
     #[serde(default, alias = "choice")]
     pub ranking: Option<RankingEvidence>,
 }
@@ -37,75 +38,80 @@ fn action_length_first() -> usize {
     ACTION_LENGTH_FIRST
 }
 
-/// What the ranking was fitted to, and its cross-fitted gain: no model that an episode is judged with has seen an episode
-/// of its fold.
+/// The data of the ranking and its cross-fitted gain: every episode is evaluated by models that
+/// were fitted without its fold.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RankingEvidence {
     /// Episodes whose decisions had several candidates.
     pub episodes: usize,
-    /// Their decisions.
+    /// Number of their decisions.
     pub decisions: usize,
-    /// Gain of the best-ranked candidate, with a target factor of 1: a larger one pays only over many decisions.
+    /// Gain of the best-ranked candidate with a target factor of 1. A larger factor pays off only
+    /// over many decisions.
     pub gain: ReRankingGain,
-    /// Gain of the medoid, by the same measure.
+    /// Gain of the medoid, measured in the same way.
     pub medoid_gain: ReRankingGain,
 }
 
-/// Estimated gain from re-ranking single decisions: the sum, over an episode's decisions, of what choosing another
-/// candidate in that decision alone would change.
+/// Estimated gain from re-ranking single decisions: the sum over an episode's decisions of the
+/// change if only that decision selected another candidate.
 ///
-/// It compares rankings on the same episodes. It is no forecast: changes of many decisions do not add up.
+/// It compares rankings on the same episodes. It is not a forecast, because changes of several
+/// decisions do not add up.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReRankingGain {
-    /// Percentage points of success, mean of the episodes.
+    /// Gain in success rate in percentage points; the mean over the episodes.
     #[serde(alias = "points")]
     pub percentage_points: f64,
-    /// Of that mean; episodes of one initial layout count as one cluster.
+    /// Standard error of the mean; episodes with the same initial layout are one cluster.
     pub standard_error: f64,
 }
 
-/// How a verifier is trained.
+/// The training options.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrainingOptions {
-    /// Seed of the split, the first weights and the order of samples.
+    /// Seed of the split, the initial weights and the order of samples.
     pub seed: u64,
     /// Sizes of the two hidden layers.
     pub hidden_sizes: [usize; 2],
-    /// Passes over the training samples at most.
+    /// Maximum number of passes over the training samples.
     pub epochs_max: usize,
-    /// Passes without a better validation loss after which training stops.
+    /// Training stops after this number of passes without a better validation loss.
     pub patience_epochs: usize,
-    /// Samples per step of the optimizer.
+    /// Samples per optimizer step.
     pub batch_samples: usize,
-    /// Step size of AdamW.
+    /// Learning rate of AdamW.
     pub learning_rate: f64,
     /// Decoupled weight decay of AdamW.
     pub weight_decay: f64,
-    /// Share of the initial layouts of every task that decides when training stops. 0 in files of the first format,
-    /// whose training stopped by the loss on the held-out episodes.
+    /// Share of each task's initial layouts whose loss stops the training. 0 in files of the first
+    /// format, whose training was stopped by the loss on the held-out episodes.
     #[serde(default)]
     pub validation_share: f64,
-    /// Share of the initial layouts of every task that nothing is fitted to or chosen by.
+    /// Share of each task's initial layouts that is used neither for fitting nor for selection.
     pub held_out_share: f64,
-    /// Whether to fit a ranking where there are episodes for it; without one this is the paper's verifier.
+    /// Whether to fit a ranking if there are enough episodes for it. Without a ranking this is the
+    /// paper's verifier.
     #[serde(alias = "choice")]
     pub ranking: bool,
-    /// Share of each later change of value that counts for an action's advantage, per decision: TD(lambda)'s lambda.
+    /// TD(lambda)'s lambda: the weight of later changes of value in an action's advantage, per
+    /// decision.
     pub advantage_decay: f64,
-    /// Ridge of the ranking's regression, in units of a standardised feature's variance.
+    /// Ridge penalty of the ranking's regression, in units of a standardised feature's variance.
     #[serde(alias = "choice_ridge")]
     pub ranking_ridge: f64,
-    /// What the weights of the nearness to the target are multiplied by. The regression sees what one decision does
-    /// while all later ones drift on; a gripper that is led by every decision keeps what it has gained.
+    /// Factor of the weights for the distance to the target. The regression measures the effect of
+    /// a single decision while later decisions drift; if every decision is guided, the effects
+    /// accumulate.
     #[serde(alias = "aim_factor")]
     pub target_factor: f64,
 }
 
 impl TrainingOptions {
-    /// Refuses options that no training can follow.
+    /// Checks that the options are valid for training.
     pub fn check(&self) -> anyhow::Result<()> {
         let TrainingOptions { hidden_sizes, epochs_max, batch_samples, learning_rate, .. } = self;
         let TrainingOptions { validation_share, held_out_share, .. } = self;
@@ -128,7 +134,7 @@ impl TrainingOptions {
         }
         ensure!(
             validation_share + held_out_share < 1.0,
-            "validation and held-out share: expected less than 1 together, got {}",
+            "validation and held-out share: expected a sum below 1, got {}",
             validation_share + held_out_share
         );
         ensure!(
@@ -167,28 +173,28 @@ impl Default for TrainingOptions {
     }
 }
 
-/// What a verifier was trained on.
+/// The training data of a verifier.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrainingData {
-    /// Episodes that the network was fitted to.
+    /// Number of episodes that the network was fitted to.
     pub training_episodes: usize,
-    /// How many of them succeeded.
+    /// Number of successes among them.
     pub training_successes: usize,
-    /// Their control steps with a hidden state.
+    /// Number of their control steps with a hidden state.
     pub training_samples: usize,
-    /// Episodes that decided when training stopped.
+    /// Number of episodes that determined when training stopped.
     pub validation_episodes: usize,
-    /// How many of them succeeded.
+    /// Number of successes among them.
     pub validation_successes: usize,
-    /// Their control steps with a hidden state.
+    /// Number of their control steps with a hidden state.
     pub validation_samples: usize,
-    /// Episodes held out.
+    /// Number of held-out episodes.
     pub held_out_episodes: usize,
-    /// How many of them succeeded.
+    /// Number of successes among them.
     pub held_out_successes: usize,
-    /// Their control steps with a hidden state.
+    /// Number of their control steps with a hidden state.
     pub held_out_samples: usize,
-    /// Passes over the training samples until the weights that were kept.
+    /// Number of passes up to the weights that were kept.
     pub epochs: usize,
 }

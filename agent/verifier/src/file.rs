@@ -1,4 +1,5 @@
-//! The verifier's file: safetensors with the weights in f32 and the description as JSON in the metadata.
+//! The file format of a verifier: safetensors with weights in f32 and the description as JSON in
+//! the metadata.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
@@ -15,27 +16,28 @@ use crate::{
     VerifierDescription,
 };
 
-/// Metadata key of the description; one key, because the order of several would not be the same twice.
+/// Metadata key of the description. There is only one key, because several would be written in
+/// random order.
 const DESCRIPTION_KEY: &str = "rever.verifier";
 const MEAN: &str = "standardisation.mean";
 const DEVIATION: &str = "standardisation.deviation";
 const LAYERS: [&str; 3] = ["hidden_1", "hidden_2", "output"];
 const RANKING: &str = "ranking.weight";
-/// Followed by the instruction.
+/// Prefixes of tensor names; the instruction follows.
 const TARGETS: [(Stage, &str); 2] =
     [(Stage::Grasp, "target.grasp."), (Stage::Place, "target.place.")];
 
-/// What a file holds.
+/// The content of a file.
 pub struct Contents {
-    /// Scores hidden states.
+    /// The network that scores hidden states.
     pub network: Network,
-    /// Tells candidates apart; none in the paper's verifier.
+    /// The ranking of candidates; `None` in the paper's verifier.
     pub ranking: Option<Ranking>,
-    /// What it is.
+    /// The description of the verifier.
     pub description: VerifierDescription,
 }
 
-/// The bytes of a file: the same verifier always gives the same bytes.
+/// Encodes a verifier. The same verifier always gives the same bytes.
 pub fn encode(
     network: &Network,
     ranking: Option<&Ranking>,
@@ -70,7 +72,7 @@ pub fn encode(
     Ok(safetensors::serialize(views, Some(metadata))?)
 }
 
-/// Reads a file's bytes; every tensor must be there with its size, and no other.
+/// Decodes a file. It must contain exactly the expected tensors with the expected shapes.
 pub fn decode(bytes: &[u8]) -> anyhow::Result<Contents> {
     let bytes_found = bytes.len() as u64;
     ensure!(
@@ -107,7 +109,7 @@ pub fn decode(bytes: &[u8]) -> anyhow::Result<Contents> {
 
 type Tensors<'a> = BTreeMap<String, TensorView<'a>>;
 
-/// Today's name of a tensor, some of which have others in files of the first format.
+/// The current name of a tensor; files of the first format use other names.
 fn current_name(name: &str) -> Cow<'_, str> {
     match name.strip_prefix("aim.") {
         Some(rest) => format!("target.{rest}").into(),
@@ -163,8 +165,9 @@ fn bytes_of(values: &[f32]) -> Vec<u8> {
 }
 
 fn read(tensors: &Tensors<'_>, name: &str, shape: &[usize]) -> anyhow::Result<Vec<f32>> {
-    let tensor =
-        tensors.get(name).with_context(|| format!("verifier file: expected tensor {name}"))?;
+    let tensor = tensors
+        .get(name)
+        .with_context(|| format!("verifier file: expected tensor {name}, got none"))?;
     ensure!(
         tensor.dtype() == Dtype::F32 && tensor.shape() == shape,
         "tensor {name}: expected F32 {shape:?}, got {:?} {:?}",

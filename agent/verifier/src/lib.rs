@@ -1,25 +1,26 @@
-//! The learned scorer: how likely the episode is to succeed if a candidate is executed.
+//! The learned verifier: predicts how likely an episode is to succeed if a candidate is executed.
 //!
 //! ```text
-//! last hidden states ─▶ mean ─▶ network (equation 4): how promising the situation is ─────────────────┐
-//! confidence, actions ─▶ against the other candidates ─▶ ranking: which candidate is better ──────────┴▶ a logit each
+//! last hidden states ─▶ mean ─▶ network (equation 4): value of the situation ──────┐
+//! confidence, actions ─▶ relative to the others ─▶ ranking: candidate's advantage ─┴▶ logits
 //! objects in the reasoning ─▶ target model: where the gripper should go ─▶ ranking
 //! ```
 //!
-//! [`Verifier`] is a [`decision::Scorer`]; [`training`] makes one from the records of finished episodes.
+//! [`Verifier`] implements [`decision::Scorer`]; [`training`] trains one from the records of
+//! finished episodes.
 
-// What scores.
+// Scoring.
 mod verifier;
 
 mod network;
 mod ranking;
 mod target;
 
-// What is kept.
+// The file format.
 mod description;
 mod file;
 
-// How it is made and judged.
+// Training and evaluation.
 mod metrics;
 pub mod training;
 

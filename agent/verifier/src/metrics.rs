@@ -1,4 +1,4 @@
-//! How well a verifier separates successes from failures on episodes it was not fitted to.
+//! How well a verifier separates successes from failures on held-out episodes.
 
 use std::collections::BTreeMap;
 
@@ -7,25 +7,25 @@ use evaluation::calibration::{BINS, ReliabilityBin, brier_score, calibration_err
 use evaluation::statistics::auroc;
 use serde::{Deserialize, Serialize};
 
-/// Steps that count as the beginning or the end of an episode.
+/// Number of steps in the first and in the last phase of an episode.
 pub const PHASE_STEPS: usize = 10;
 
-/// Scored samples with their truth; the lists run in parallel.
+/// Scored samples with their labels; all lists have the same length.
 #[derive(Clone, Debug, Default)]
 pub struct ScoredSamples {
     /// The verifier's logits.
     pub logits: Vec<f32>,
     /// Whether the sample's episode succeeded.
     pub labels: Vec<bool>,
-    /// The sample's task, with its variant where that is not the default one.
+    /// The sample's task, with its variant unless that is the default.
     pub tasks: Vec<String>,
-    /// The sample's control step, counted from 0.
+    /// The sample's control step, from 0.
     pub steps: Vec<usize>,
-    /// How many control steps its episode has.
+    /// The number of control steps of the sample's episode.
     pub episode_steps: Vec<usize>,
 }
 
-/// Quality on samples of held-out episodes, which no weight was fitted to and nothing was chosen by.
+/// Quality on samples of held-out episodes, which were used neither for fitting nor for selection.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Metrics {
@@ -33,28 +33,29 @@ pub struct Metrics {
     pub loss: Option<f64>,
     /// All steps.
     pub auroc: Discrimination,
-    /// The first [`PHASE_STEPS`] steps, where choosing well still matters most.
+    /// The first [`PHASE_STEPS`] steps, in which a good choice has the largest effect.
     pub auroc_first_steps: Discrimination,
-    /// The steps between these.
+    /// The steps in between.
     pub auroc_middle_steps: Discrimination,
     /// The last [`PHASE_STEPS`] steps, where the outcome is often visible.
     pub auroc_last_steps: Discrimination,
-    /// Mean squared difference of probability and outcome.
+    /// Mean squared difference between probability and outcome.
     pub brier_score: Option<f64>,
-    /// Expected calibration error over `reliability`.
+    /// Expected calibration error, computed from `reliability`.
     pub calibration_error: Option<f64>,
     /// The reliability diagram.
     pub reliability: Vec<ReliabilityBin>,
 }
 
-/// AUROC in three views; `None` where a class is missing.
+/// AUROC in three variants; `None` if a class is missing.
 ///
-/// The pooled value misleads: telling easy tasks from hard ones already raises it, and that ranks no candidate of a
-/// decision. The macro average is free of that, yet it still rewards recognising an easy layout.
+/// The pooled value is misleading: it rises if the verifier only separates easy from hard tasks,
+/// which ranks no candidate of a decision. The macro average avoids that, but still rewards
+/// recognising an easy layout.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Discrimination {
-    /// Over the samples of all tasks together.
+    /// All samples of all tasks.
     pub pooled: Option<f64>,
     /// The mean over the tasks that have a value.
     pub macro_average: Option<f64>,
@@ -63,7 +64,8 @@ pub struct Discrimination {
 }
 
 impl Metrics {
-    /// Measures scored samples; `positive_share` is the share of positives that gave the training its class weights.
+    /// Computes the metrics; `positive_share` is the share of positives that determined the class
+    /// weights of the training.
     pub fn measure(samples: &ScoredSamples, positive_share: f64) -> Metrics {
         let probabilities: Vec<f32> =
             samples.logits.iter().map(|logit| probability(*logit)).collect();
@@ -120,11 +122,13 @@ impl ScoredSamples {
     }
 }
 
-/// Equation 4 over scored samples, in f64; the training loss is the same in tensors. `None` without samples.
+/// Equation 4 over scored samples in f64; the training loss computes the same with tensors. `None`
+/// without samples.
 ///
-/// With D+ the positives among all samples D, w+ = |D| / 2|D+| and w- = |D| / 2|D-|, and the loss is the mean over D of
-/// w+ ln(1 + e^-z) for positives and w- ln(1 + e^z) for negatives, z being the logit. The mean runs over all of D: only then
-/// do both classes contribute equally, which is what the paper says the weights are for.
+/// D are all samples, D+ the positives and D- the negatives. The weights are w+ = |D| / 2|D+| and
+/// w- = |D| / 2|D-|. The loss is the mean over D of w+ ln(1 + e^-z) for positives and w- ln(1 +
+/// e^z) for negatives, where z is the logit. The mean must be over all of D so that both classes
+/// contribute equally, which is the purpose of the weights in the paper.
 pub fn weighted_loss(logits: &[f32], labels: &[bool], positive_share: f64) -> Option<f64> {
     assert_eq!(logits.len(), labels.len(), "one label per logit");
     let (positive, negative) = (0.5 / positive_share, 0.5 / (1.0 - positive_share));
@@ -135,7 +139,7 @@ pub fn weighted_loss(logits: &[f32], labels: &[bool], positive_share: f64) -> Op
     (!logits.is_empty()).then(|| losses.sum::<f64>() / logits.len() as f64)
 }
 
-/// ln(1 + e^x) without overflow: for large x it is x plus a vanishing rest.
+/// ln(1 + e^x) without overflow.
 fn softplus(x: f64) -> f64 {
     x.max(0.0) + (-x.abs()).exp().ln_1p()
 }
@@ -156,7 +160,8 @@ mod tests {
 
     #[test]
     fn a_score_that_only_knows_the_task_looks_good_when_pooled() {
-        // Task a succeeds in three of four samples, task b in one of four; the score tells the tasks apart and nothing else.
+        // Task a succeeds in three of four samples, task b in one of four. The score separates the
+        // tasks and nothing else.
         let rows: Vec<_> = (0..8)
             .map(|i| if i < 4 { (1.0, i != 0, "a", 0, 60) } else { (-1.0, i == 4, "b", 0, 60) })
             .collect();
@@ -173,7 +178,8 @@ mod tests {
     fn phases_are_the_first_ten_and_the_last_ten_steps() {
         let mut rows = Vec::new();
         for step in 0..30 {
-            // The score is wrong in the first ten steps, silent in the middle, right in the last ten.
+            // The score is wrong in the first ten steps, uninformative in the middle and right in
+            // the last ten.
             let strength = if step < 10 {
                 -1.0
             } else if step < 20 {
@@ -192,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_task_with_one_class_has_no_value_and_does_not_spoil_the_average() {
+    fn a_task_with_one_class_has_no_value_and_is_not_in_the_average() {
         let rows = [(1.0, true, "a", 0, 60), (0.0, false, "a", 0, 60), (0.5, true, "b", 0, 60)];
         let metrics = Metrics::measure(&samples(&rows), 0.5);
         assert_eq!(metrics.auroc.tasks["b"], None);
@@ -202,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn the_loss_of_an_undecided_verifier_is_ln_2_whatever_the_classes() {
+    fn the_loss_of_an_undecided_verifier_is_ln_2_for_any_classes() {
         let labels: Vec<bool> = (0..10).map(|i| i < 7).collect();
         let loss = weighted_loss(&[0.0; 10], &labels, 0.7).expect("samples");
         assert!((loss - 2.0_f64.ln()).abs() < 1e-12);

@@ -1,30 +1,33 @@
-//! The verifier's arithmetic: standardise, two hidden layers with ReLU, one logit.
+//! The verifier's network: standardisation, two hidden layers with ReLU, one logit.
 //!
-//! Plain loops in a fixed order: a few microseconds a row, and a row's result cannot depend on the batch or the thread count.
+//! Plain loops in a fixed order take a few microseconds per row. A row's result does not depend on
+//! the batch or on the number of threads.
 
 use anyhow::ensure;
 
-/// Largest absolute value of a hidden state: the largest 16-bit float, which is what records keep.
+/// Maximum absolute value in a hidden state: the largest 16-bit float, because records store 16
+/// bits.
 const INPUT_MAX: f32 = 65_504.0;
 
-/// A network in which some hidden state could make a larger sum is refused. Training makes sums of at most about 1e10;
-/// 32 bits end at 3e38.
+/// Maximum sum that any hidden state may produce in an accepted network. Training produces at most
+/// about 1e10; the largest f32 is 3e38.
 const SUM_MAX: f64 = 1e30;
 
-/// Shift and scale that make every input about as large as the others, measured on the training samples.
+/// Mean and standard deviation of every input, measured on the training samples.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Standardisation {
     /// Subtracted from the input.
     pub mean: Vec<f32>,
-    /// Divides the difference; above 0 everywhere.
+    /// Divides the difference; always above 0.
     pub deviation: Vec<f32>,
 }
 
 impl Standardisation {
-    /// Below this a feature counts as constant and is only shifted: dividing by noise would blow it up.
+    /// A feature with a smaller deviation counts as constant and is only shifted: dividing by it
+    /// would amplify noise.
     const DEVIATION_MIN: f64 = 1e-6;
 
-    /// Measures rows of `size` values that lie one after another.
+    /// Measures rows of `size` values.
     pub fn of<'a>(size: usize, rows: impl Iterator<Item = &'a [f32]> + Clone) -> Standardisation {
         let count = rows.clone().count().max(1) as f64;
         let mut mean = vec![0.0_f64; size];
@@ -59,9 +62,9 @@ impl Standardisation {
 /// One affine layer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
-    /// (outputs, inputs), row by row: the order of the file.
+    /// (outputs, inputs), row by row, as in the file.
     weight: Vec<f32>,
-    /// (inputs, outputs): the order of the loop, so that the inner one runs over contiguous outputs.
+    /// (inputs, outputs): the inner loop runs over contiguous outputs.
     transposed: Vec<f32>,
     bias: Vec<f32>,
 }
@@ -86,12 +89,12 @@ impl Layer {
         Ok(Layer { transposed, weight, bias })
     }
 
-    /// Length of the vector that goes in.
+    /// Length of the input vector.
     pub fn inputs(&self) -> usize {
         self.weight.len() / self.bias.len()
     }
 
-    /// Length of the vector that comes out.
+    /// Length of the output vector.
     pub fn outputs(&self) -> usize {
         self.bias.len()
     }
@@ -106,7 +109,7 @@ impl Layer {
         &self.bias
     }
 
-    /// The largest absolute value of each output for inputs within `bounds`.
+    /// The maximum absolute value of each output for inputs within `bounds`.
     fn bounds(&self, bounds: &[f64]) -> Vec<f64> {
         let output = |(weights, bias): (&[f32], &f32)| {
             let products = weights.iter().zip(bounds);
@@ -125,7 +128,7 @@ impl Layer {
     }
 }
 
-/// The whole network; its layers fit each other.
+/// The whole network; the sizes of its layers match.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Network {
     standardisation: Standardisation,
@@ -133,7 +136,7 @@ pub struct Network {
 }
 
 impl Network {
-    /// A network of two hidden layers and one output.
+    /// A network with two hidden layers and one output.
     pub fn new(standardisation: Standardisation, layers: [Layer; 3]) -> anyhow::Result<Network> {
         let size = standardisation.mean.len();
         let deviations = &standardisation.deviation;
@@ -169,8 +172,8 @@ impl Network {
         Ok(network)
     }
 
-    /// The largest absolute value that any sum can reach while a hidden state of 16-bit floats is scored: a logit is
-    /// finite where this is.
+    /// Upper bound of the absolute value of any sum during the scoring of a hidden state of 16-bit
+    /// floats. If it is finite, so is every logit.
     fn sum_max(&self) -> f64 {
         let Standardisation { mean, deviation } = &self.standardisation;
         let input = mean.iter().zip(deviation);
@@ -190,7 +193,7 @@ impl Network {
         self.standardisation.mean.len()
     }
 
-    /// What is done to a hidden state before the first layer.
+    /// The standardisation of a hidden state before the first layer.
     pub fn standardisation(&self) -> &Standardisation {
         &self.standardisation
     }
@@ -200,8 +203,8 @@ impl Network {
         &self.layers
     }
 
-    /// Refuses a hidden state that has no meaningful logit: of another length, or not of 16-bit floats. A number that
-    /// is none would not show in the logit, because the activation makes 0 of it.
+    /// Checks that a hidden state has the right length and consists of 16-bit floats. NaN must be
+    /// detected here, because the ReLU turns it into 0.
     pub fn check(&self, hidden: &[f32]) -> anyhow::Result<()> {
         let (expected, got) = (self.input_size(), hidden.len());
         ensure!(got == expected, "expected a hidden state of {expected} values, got {got}");
@@ -232,7 +235,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_network_small_enough_to_compute_by_hand() {
+    fn a_small_network_equals_the_computation_by_hand() {
         let standardisation = Standardisation { mean: vec![1.0, 0.0], deviation: vec![2.0, 0.5] };
         let layers = [
             Layer::new(vec![1.0, 2.0, -1.0, 0.5], vec![0.0, 1.0]),
@@ -241,9 +244,11 @@ mod tests {
         ];
         let network = Network::new(standardisation, layers.map(|layer| layer.expect("whole")))
             .expect("fitting");
-        // Standardised [1, 2]; first layer [5, 1]; second relu([5, -4.75]) = [5, 0]; output 2 * 5 + 0.5.
+        // Standardised [1, 2]; first layer [5, 1]; second relu([5, -4.75]) = [5, 0];
+        // output 2 * 5 + 0.5.
         assert_eq!(network.logit(&[3.0, 1.0]), 10.5);
-        // Standardised [-1, -2]; first relu([-5, 1]) = [0, 1]; second relu([0, 0.25]); output 3 * 0.25 + 0.5.
+        // Standardised [-1, -2]; first relu([-5, 1]) = [0, 1]; second relu([0, 0.25]);
+        // output 3 * 0.25 + 0.5.
         assert_eq!(network.logit(&[-1.0, -1.0]), 1.25);
     }
 

@@ -1,9 +1,10 @@
-//! Which of several candidates is better, as outcomes have shown.
+//! The ranking of candidates, learned from outcomes.
 //!
-//! The score of a hidden state mostly says how promising the situation is, which is the same for all candidates of one
-//! decision. This part looks only at what differs between them: how sure the policy was of each part of the reasoning and
-//! of the action, how far the action is from those of the others, and how near it brings the gripper to its target. It is
-//! linear, because one action changes an episode's outcome by little and only few numbers can be learned from that.
+//! The network's score mostly describes the situation, which is the same for all candidates of a
+//! decision. The ranking uses only what differs between them: the policy's confidence in each part
+//! of reasoning and action, the distance of the action from the other candidates' actions, and the
+//! distance of the gripper from its target. It is linear, because a single action changes the
+//! outcome of an episode only slightly, so that few parameters can be learned.
 
 use std::ops::Range;
 
@@ -12,35 +13,35 @@ use decision::{ActionChunk, ActionSpace, Candidate, CandidateAction, STAGES, TAG
 
 use crate::target::{PredictedTarget, TargetModel};
 
-/// A larger weight is refused: features are of the order of 1, and a probability changes by at most 1.
+/// Maximum absolute weight: features are of the order of 1, and a probability changes by at most 1.
 const WEIGHT_MAX: f32 = 1e6;
 
-/// Where each feature of a candidate stands; how many there are depends on the policy's actions.
+/// The indices of a candidate's features; their number depends on the policy's actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FeatureLayout {
-    /// Numbers of an action.
+    /// Number of dimensions of an action.
     pub action_length: usize,
 }
 
 impl FeatureLayout {
-    /// Log-probabilities of the parts of the reasoning and of the numbers of the action.
+    /// Log-probabilities of the parts of the reasoning and of the dimensions of the action.
     pub fn confidence(self) -> Range<usize> {
         0..TAGS.len() + self.action_length
     }
 
-    /// Distance of each number of the action from the candidates' mean. The penalties: of these more is never better,
-    /// of all other features less is never better.
+    /// Distance of each dimension of the action from the candidates' mean. Their weights are never
+    /// positive; the weights of all other features are never negative.
     pub fn deviations(self) -> Range<usize> {
         let start = self.confidence().end;
         start..start + self.action_length
     }
 
-    /// Nearness to the other candidates, which is largest for the medoid.
+    /// Negative mean distance to the other candidates; largest for the medoid.
     pub fn nearness(self) -> usize {
         self.deviations().end
     }
 
-    /// Nearness to the target, one for each stage.
+    /// Negative distance to the target, one per stage.
     pub fn target(self) -> Range<usize> {
         let start = self.nearness() + 1;
         start..start + STAGES
@@ -52,17 +53,17 @@ impl FeatureLayout {
     }
 }
 
-/// What has been learned of how candidates rank.
+/// A fitted ranking.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ranking {
     layout: FeatureLayout,
-    /// The change of the probability of success per unit of each feature.
+    /// Change of the success probability per unit of each feature.
     weights: Vec<f32>,
     target_model: TargetModel,
 }
 
 impl Ranking {
-    /// Refuses weights that are too few, too many, not finite or huge.
+    /// Checks that the weights are as many as the features, finite and not too large.
     pub fn new(
         layout: FeatureLayout,
         weights: Vec<f32>,
@@ -79,42 +80,45 @@ impl Ranking {
         Ok(Ranking { layout, weights, target_model })
     }
 
-    /// What the weights belong to.
+    /// The meaning of the weights.
     pub fn layout(&self) -> FeatureLayout {
         self.layout
     }
 
-    /// One for each feature.
+    /// One weight per feature.
     pub fn weights(&self) -> &[f32] {
         &self.weights
     }
 
-    /// Where the gripper should go.
+    /// The model of the gripper's target.
     pub fn target_model(&self) -> &TargetModel {
         &self.target_model
     }
 
-    /// The change of the probability of success that a candidate brings, against the mean of all candidates.
+    /// The change of the success probability by a candidate, relative to the mean of all
+    /// candidates.
     pub fn advantage(&self, features: &[f32]) -> f32 {
         self.weights.iter().zip(features).map(|(weight, value)| weight * value).sum()
     }
 }
 
-/// How the well-formed candidates of one decision differ, one row of features each; every feature's mean is 0.
+/// The features of the well-formed candidates of one decision, one row each. Every feature has mean
+/// 0.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CandidateFeatures {
     layout: FeatureLayout,
     rows: Vec<Vec<f32>>,
-    /// How far each candidate moves the gripper, x and y in the base frame, metres.
+    /// The gripper's motion by each candidate: x and y in the base frame, in metres.
     motions: Vec<[f32; 2]>,
 }
 
 impl CandidateFeatures {
-    /// Compares candidates, without a target yet; refuses those that do not have the policy's parts and numbers.
+    /// Computes the features without a target. Refuses candidates that do not have the policy's
+    /// parts and dimensions.
     ///
-    /// Deviations are those from the mean action, without their sign: a ranking that always leans to the better side
-    /// leaves the states in which that side was better. A number without range cannot tell candidates apart and
-    /// deviates by 0. Of a chunk of several actions the mean counts.
+    /// Deviations from the mean action have no sign: a ranking that always prefers one direction
+    /// leaves the states in which that direction was better. A dimension without a range has
+    /// deviation 0. A chunk is represented by its mean action.
     pub fn of(candidates: &[Candidate], space: &ActionSpace) -> anyhow::Result<CandidateFeatures> {
         let layout = FeatureLayout { action_length: space.length() };
         let well_formed: Vec<(&Candidate, CandidateAction<'_>)> =
@@ -126,7 +130,7 @@ impl CandidateFeatures {
                 "expected a candidate with the log-probabilities of {expected} parts, got {got}"
             );
             let (expected, got) = (layout.action_length, action.actions.action_length());
-            ensure!(got == expected, "expected actions of {expected} numbers, got {got}");
+            ensure!(got == expected, "expected actions with {expected} dimensions, got {got}");
         }
         let actions: Vec<Option<CandidateAction<'_>>> =
             well_formed.iter().map(|(_, action)| Some(*action)).collect();
@@ -162,7 +166,8 @@ impl CandidateFeatures {
         Ok(CandidateFeatures { layout, motions: motions.collect(), rows })
     }
 
-    /// Fills in how much nearer than the mean each candidate brings the gripper to the target.
+    /// Sets the target features: how much nearer to the target than the mean each candidate brings
+    /// the gripper.
     pub fn set_target(&mut self, target: Option<PredictedTarget>) {
         let distances = |target: PredictedTarget| {
             self.motions.iter().map(move |motion| -target.distance(*motion))
@@ -178,18 +183,18 @@ impl CandidateFeatures {
         }
     }
 
-    /// What the features mean.
+    /// The meaning of the features.
     pub fn layout(&self) -> FeatureLayout {
         self.layout
     }
 
-    /// One row for each well-formed candidate, in their order.
+    /// One row per well-formed candidate, in order.
     pub fn rows(&self) -> &[Vec<f32>] {
         &self.rows
     }
 }
 
-/// The sum of a chunk's actions, number by number.
+/// The sum of a chunk's actions in each dimension.
 fn motion(actions: &ActionChunk) -> Vec<f32> {
     let mut sum = vec![0.0; actions.action_length()];
     for action in actions.actions() {
@@ -198,7 +203,7 @@ fn motion(actions: &ActionChunk) -> Vec<f32> {
     sum
 }
 
-/// The mean of rows of `length` values; zeros when there is none.
+/// The mean of rows of `length` values; zeros if there are no rows.
 fn mean(rows: &[Vec<f32>], length: usize) -> Vec<f32> {
     let mut sum = vec![0.0; length];
     for row in rows {
@@ -231,7 +236,7 @@ mod tests {
         }
     }
 
-    /// One that moves by x; the policy is the less sure of its third part the farther it moves.
+    /// A candidate that moves by x. The larger x is, the lower is the confidence of its third part.
     fn moving(x: f32, bin: u32, gripper: f32) -> Candidate {
         let tokens = vec![bin, 500, 500, 500, 500, 500, if gripper > 0.0 { 599 } else { 400 }];
         let mut confidence = vec![0.0; BRIDGE.confidence().len()];
@@ -259,17 +264,18 @@ mod tests {
         let mut features = CandidateFeatures::of(&candidates, &space()).expect("whole");
         // Log-probabilities -1, -3 and -2.
         check(features.rows(), 2, [1.0, -1.0, 0.0]);
-        // x deviates by 1, 1 and 0 units of 0.1; their mean is 2/3.
+        // x deviates by 1, 1 and 0 units of 0.1; the mean deviation is 2/3.
         let deviations = BRIDGE.deviations().start;
         check(features.rows(), deviations, [1.0 / 3.0, 1.0 / 3.0, -2.0 / 3.0]);
         // Roll has no range here.
         check(features.rows(), deviations + 3, [0.0; 3]);
-        // The gripper, of which one unit is 2: two open, one closed, the mean at 1/3.
+        // One unit of the gripper is 2. Two candidates open it, one closes it, so the mean is 1/3.
         check(features.rows(), deviations + 6, [-1.0 / 9.0, -1.0 / 9.0, 2.0 / 9.0]);
-        // Mean distances 0.6, 0.7 and 1.1 (51 bins are a fifth of the range, the other gripper side is 1).
+        // Mean distances 0.6, 0.7 and 1.1: 51 bins are a fifth of the range, an opposite gripper
+        // command is 1.
         check(features.rows(), BRIDGE.nearness(), [0.2, 0.1, -0.3]);
         check(features.rows(), BRIDGE.target().start + 1, [0.0; 3]);
-        // Nothing is grasped; 10, 10 and 0 cm from the target.
+        // Nothing is grasped; the distances to the target are 10, 10 and 0 cm.
         features.set_target(Some(PredictedTarget { stage: Stage::Place, offset: [0.2, 0.0] }));
         check(features.rows(), BRIDGE.target().start, [0.0; 3]);
         check(features.rows(), BRIDGE.target().start + 1, [-0.1 / 3.0, -0.1 / 3.0, 0.2 / 3.0]);
@@ -286,9 +292,9 @@ mod tests {
         let candidates = [of(1.0), of(2.0), of(3.0)];
         let mut features = CandidateFeatures::of(&candidates, &space).expect("whole");
         assert_eq!((layout.length(), features.layout()), (16, layout));
-        // Means of 1.5, 3 and 4.5, in units of 0.5, deviate by 3, 0 and 3.
+        // The means 1.5, 3 and 4.5 deviate by 3, 0 and 3 units of 0.5.
         check(features.rows(), layout.deviations().start, [1.0, -2.0, 1.0]);
-        // Moved by 3, 6 and 9.
+        // The motions are 3, 6 and 9.
         features.set_target(Some(PredictedTarget { stage: Stage::Grasp, offset: [9.0, 0.0] }));
         check(features.rows(), layout.target().start, [-3.0, 0.0, 3.0]);
     }
@@ -317,11 +323,11 @@ mod tests {
         let mut shorter = moving(0.1, 500, 1.0);
         shorter.confidence.pop();
         let space = ActionSpace { scale: vec![1.0; 6], gripper: None };
-        assert_eq!(refuse(shorter, &space), "expected actions of 6 numbers, got 7");
+        assert_eq!(refuse(shorter, &space), "expected actions with 6 dimensions, got 7");
     }
 
     #[test]
-    fn weights_that_are_no_changes_of_a_probability_are_refused() {
+    fn weights_that_are_not_finite_or_too_large_are_refused() {
         let refuse = |weights: Vec<f32>| {
             let ranking = Ranking::new(BRIDGE, weights, TargetModel::default());
             ranking.expect_err("refused").to_string()

@@ -1,31 +1,32 @@
-//! Where the gripper should go, given where the objects are.
+//! The target model: where the gripper should be, given the objects' bounding boxes.
 //!
-//! Which position of the gripper belongs to an object's bounding box is learned from where grasps were made and where
-//! successful episodes released the object. A candidate whose action brings the gripper nearer to that position agrees
-//! with all the reasoning of the episode so far.
+//! The map from an object's bounding box to the gripper's position is learned from the positions of
+//! grasps and of the releases of successful episodes. A candidate that brings the gripper nearer to
+//! the target agrees with the reasoning of the whole episode so far.
 
 use std::collections::BTreeMap;
 
 use anyhow::ensure;
 use decision::{BoundingBox, Stage, TrackedObjects};
 
-/// Terms of a map's polynomial: 1, the four sides, their squares and products.
+/// Terms of the polynomial: 1, the four sides, their squares and products.
 pub const TERMS: usize = 15;
 
-/// Sides are counted from the middle of the square, in units of this many pixels.
+/// Sides are measured from the image centre in units of this many pixels.
 const UNIT_PIXELS: f64 = 64.0;
 
-/// A map with a larger coefficient is refused: no gripper is a kilometre away from its base.
+/// Maximum coefficient in metres: no gripper is a kilometre away from its base.
 const COEFFICIENT_MAX: f32 = 1e3;
 
-/// From an object's box to a position of the gripper: x and y in the robot's base frame, metres.
+/// The map from an object's box to a gripper position: x and y in the robot's base frame, in
+/// metres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TargetMap {
     coefficients: [[f32; 2]; TERMS],
 }
 
 impl TargetMap {
-    /// Refuses coefficients that are not finite or larger than any gripper's reach.
+    /// Checks that the coefficients are finite and not too large.
     pub fn new(coefficients: [[f32; 2]; TERMS]) -> anyhow::Result<TargetMap> {
         for number in coefficients.as_flattened() {
             ensure!(
@@ -36,12 +37,12 @@ impl TargetMap {
         Ok(TargetMap { coefficients })
     }
 
-    /// Of x and y, term by term.
+    /// The coefficients of x and y for each term.
     pub fn coefficients(&self) -> &[[f32; 2]; TERMS] {
         &self.coefficients
     }
 
-    /// Where the gripper should be for an object with these bounds.
+    /// The gripper position for an object with these bounds.
     pub fn position(&self, bounds: &BoundingBox) -> [f32; 2] {
         let terms = terms(bounds);
         [0, 1].map(|axis| {
@@ -51,7 +52,7 @@ impl TargetMap {
     }
 }
 
-/// What a position is a linear function of.
+/// The polynomial's terms for a box.
 pub fn terms(bounds: &BoundingBox) -> [f64; TERMS] {
     let sides = bounds.map(|side| (f64::from(side) - 128.0) / UNIT_PIXELS);
     let mut terms = [1.0; TERMS];
@@ -63,23 +64,23 @@ pub fn terms(bounds: &BoundingBox) -> [f64; TERMS] {
     terms
 }
 
-/// The maps of every instruction with enough training data.
+/// The maps of all instructions with enough training data.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TargetModel {
     maps: BTreeMap<(String, Stage), TargetMap>,
 }
 
-/// Where the gripper should go from where it is.
+/// The target relative to the gripper's position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PredictedTarget {
-    /// What it heads for.
+    /// The stage that determines the target object.
     pub stage: Stage,
-    /// From the gripper, x and y in the base frame, metres.
+    /// Offset from the gripper: x and y in the base frame, in metres.
     pub offset: [f32; 2],
 }
 
 impl TargetModel {
-    /// Adds or replaces the map of a stage.
+    /// Inserts or replaces the map of a stage.
     pub fn insert(&mut self, instruction: &str, stage: Stage, map: TargetMap) {
         self.maps.insert((instruction.to_owned(), stage), map);
     }
@@ -89,8 +90,8 @@ impl TargetModel {
         self.maps.iter().map(|((instruction, stage), map)| (instruction.as_str(), *stage, map))
     }
 
-    /// The target of a gripper at x, y; none when that is not known, the gripper heads for no object or the
-    /// instruction has no map.
+    /// The target for a gripper at x, y. `None` if the gripper's position is unknown, the stage has
+    /// no target object, or the instruction has no map.
     pub fn predict(
         &self,
         instruction: &str,
@@ -105,7 +106,7 @@ impl TargetModel {
 }
 
 impl PredictedTarget {
-    /// How far the gripper is from it after moving by x and y, metres.
+    /// Distance from the target after a motion by x and y, in metres.
     pub fn distance(&self, motion: [f32; 2]) -> f32 {
         (self.offset[0] - motion[0]).hypot(self.offset[1] - motion[1])
     }
@@ -116,9 +117,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_target_is_where_the_map_of_the_stage_puts_it_from_the_gripper() {
+    fn a_target_is_the_offset_from_the_gripper_to_the_mapped_position() {
         let mut coefficients = [[0.0; 2]; TERMS];
-        // x = 0.3 + 0.1 left, y = 0.2 top x bottom, sides in units of 64 pixels from the middle.
+        // x = 0.3 + 0.1 left, y = 0.2 top x bottom, with sides in units of 64 pixels from the
+        // centre.
         coefficients[0][0] = 0.3;
         coefficients[1][0] = 0.1;
         coefficients[11][1] = 0.2;

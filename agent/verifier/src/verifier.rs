@@ -1,4 +1,5 @@
-//! The verifier: a network that scores situations, a ranking that tells candidates apart, and what is known of both.
+//! The verifier: a network that scores the situation, a ranking of the candidates, and their
+//! description.
 
 use std::path::Path;
 
@@ -9,22 +10,22 @@ use decision::{Candidate, Scorer, ScoringRequest};
 use crate::file::{self, Contents};
 use crate::{CandidateFeatures, Network, Ranking, VerifierDescription};
 
-/// A verifier file larger than this is refused before it is read: the largest sensible one is a few megabytes.
+/// Maximum size of a verifier file, checked before it is read. Typical files have a few megabytes.
 pub const FILE_BYTES_MAX: u64 = 64 * 1024 * 1024;
 
-/// Logits per unit of probability: the slope of the logit where success and failure are equally likely.
+/// The slope of the logit at a probability of 1/2: logits per unit of probability.
 const LOGITS_PER_PROBABILITY: f32 = 4.0;
 
 /// A trained verifier for one policy.
 pub struct Verifier {
     contents: Contents,
-    /// The file that this is, so that a digest is never of a second encoding.
+    /// The file's bytes, so that the digest always refers to this encoding.
     bytes: Vec<u8>,
     digest: String,
 }
 
 impl Verifier {
-    /// Reads a verifier file; refuses one that was trained for another policy than the one with `policy_digest`.
+    /// Loads a verifier file and checks that it was trained for the policy with `policy_digest`.
     pub fn load(path: &Path, policy_digest: &str) -> anyhow::Result<Verifier> {
         let bytes = read_file(path);
         let verifier = bytes.and_then(|bytes| Verifier::from_bytes(&bytes, policy_digest));
@@ -38,10 +39,11 @@ impl Verifier {
         verifier.with_context(|| format!("verifier {}", path.display()))
     }
 
-    /// Reads the contents of a verifier file, for example as they came over the wire.
+    /// Decodes a verifier file, for example one received over the network.
     pub fn from_bytes(bytes: &[u8], policy_digest: &str) -> anyhow::Result<Verifier> {
         let verifier = Verifier::from_bytes_of_any_policy(bytes)?;
-        // Hidden states of another policy mean something else: the scores would look fine and be noise.
+        // Hidden states of another policy have another meaning: the scores would look plausible and
+        // be noise.
         ensure!(
             verifier.description().policy == policy_digest,
             "expected a verifier trained for policy {policy_digest}, got one trained for policy {}",
@@ -50,15 +52,15 @@ impl Verifier {
         Ok(verifier)
     }
 
-    /// Reads a verifier file only to show what it says about itself.
+    /// Decodes a verifier file for any policy, to show its description.
     pub fn from_bytes_of_any_policy(bytes: &[u8]) -> anyhow::Result<Verifier> {
         let contents = file::decode(bytes)?;
         Ok(Verifier { contents, bytes: bytes.to_vec(), digest: file::digest(bytes) })
     }
 
-    /// Joins trained weights with what is known about them.
+    /// Makes a verifier of trained weights and their description.
     ///
-    /// It is made into a file and read back, so that it is in memory exactly what any reader of the file gets.
+    /// It is encoded and decoded, so that it equals what every reader of the file gets.
     pub fn new(
         network: &Network,
         ranking: Option<&Ranking>,
@@ -77,16 +79,17 @@ impl Verifier {
         &self.digest
     }
 
-    /// What the file says about the training and its measured quality.
+    /// The description of the training and the measured quality.
     pub fn description(&self) -> &VerifierDescription {
         &self.contents.description
     }
 
-    /// The logit of every candidate of one decision, finite for every well-formed one.
+    /// The logit of every candidate of one decision; finite for every well-formed one.
     ///
-    /// Without a ranking a logit depends on the candidate's own hidden state alone. With it, the network reads the mean
-    /// hidden state, so that it cannot prefer the candidate that merely claims more progress, and the ranking tells the
-    /// candidates apart. A malformed candidate's logit means nothing.
+    /// Without a ranking a logit depends only on the candidate's hidden state. With a ranking, the
+    /// network reads the mean hidden state, so that it cannot prefer a candidate that merely claims
+    /// more progress, and the ranking distinguishes the candidates. The logit of a malformed
+    /// candidate has no meaning.
     pub fn logits(&self, request: &ScoringRequest<'_>) -> anyhow::Result<Vec<f32>> {
         let ScoringRequest { candidates, .. } = *request;
         let Contents { network, ranking, .. } = &self.contents;
@@ -104,7 +107,8 @@ impl Verifier {
             if candidate.parsed.is_err() {
                 return Ok(0.0);
             }
-            let logit = scores.next().context("expected a score of every well-formed candidate")?;
+            let logit =
+                scores.next().context("expected a score for every well-formed candidate")?;
             ensure!(logit.is_finite(), "expected a finite score of candidate {index}, got {logit}");
             Ok(logit)
         };
@@ -119,7 +123,8 @@ fn read_file(path: &Path) -> anyhow::Result<Vec<u8>> {
     Ok(std::fs::read(path)?)
 }
 
-/// The logits of the well-formed candidates: that of the situation, and what each candidate changes.
+/// The logits of the well-formed candidates: the value of the situation plus each candidate's
+/// advantage.
 fn rank(
     network: &Network,
     ranking: &Ranking,
@@ -130,7 +135,7 @@ fn rank(
     let rows: Vec<&[f32]> = well_formed.iter().map(|candidate| &*candidate.hidden).collect();
     let situation = network.logit(&mean_hidden(&rows, network.input_size()));
     let (expected, got) = (ranking.layout().action_length, action_space.length());
-    ensure!(got == expected, "expected a policy with actions of {expected} numbers, got {got}");
+    ensure!(got == expected, "expected a policy with {expected} action dimensions, got {got}");
     let mut features = CandidateFeatures::of(candidates, action_space)?;
     let gripper = state.first_chunk().copied();
     features.set_target(ranking.target_model().predict(instruction, tracked, gripper));
@@ -149,7 +154,7 @@ impl Scorer for Verifier {
     }
 }
 
-/// The mean of hidden states of `size` values; zeros when there is none.
+/// The mean of hidden states of `size` values; zeros if there are none.
 pub fn mean_hidden(rows: &[&[f32]], size: usize) -> Vec<f32> {
     let mut mean = vec![0.0; size];
     for row in rows {

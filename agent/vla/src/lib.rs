@@ -1,26 +1,27 @@
-//! A local checkpoint in the OpenVLA/Prismatic layout as a policy: an image and an instruction in, candidates of
-//! reasoning and action out.
+//! A policy from a local checkpoint in the OpenVLA/Prismatic layout: from an image and an
+//! instruction to candidates with reasoning and action.
 //!
 //! ```text
 //! image ─▶ pixels ─▶ vision ─▶ projector ─┐
 //! instruction ─▶ prompt ──────────────────┴▶ decoder.prefill ─▶ shared prefix ─┐
 //!                                            decoder.step x N candidates ◀─────┘─▶ sampling
-//! tokens ─▶ candidate (reasoning, actions) or what is malformed about it
+//! tokens ─▶ candidate (reasoning, actions) or a reason why it is malformed
 //! ```
 //!
-//! Weights never change; caches are values passed in. What a request gets does not depend on the requests beside it.
+//! Weights are immutable; caches are passed as values. The result for a request does not depend on
+//! the other requests of the batch.
 
 // The checkpoint as a policy.
 mod policy;
 
-// What its files say: configuration, tokenizer, prompt, reasoning, action bins, weights.
+// The checkpoint's files: configuration, tokenizer, prompt, reasoning, action bins, weights.
 mod checkpoint;
 
-// The network, from the outside in, and the kernels that its layers are made of.
+// The network from the outside in, and its kernels.
 mod kernels;
 mod network;
 
-// Tokens: the decode loop, its draws, how long it takes.
+// Token generation: the decode loop, sampling, timing.
 mod generate;
 
 pub use checkpoint::completion::CompletionParser;

@@ -1,4 +1,4 @@
-//! The checkpoint as a policy.
+//! A checkpoint as a policy.
 
 use std::path::Path;
 
@@ -26,13 +26,14 @@ pub struct Vla {
 }
 
 impl Vla {
-    /// Loads a checkpoint's folder onto a device: config.json, model.safetensors (or shards), tokenizer.json.
+    /// Loads a checkpoint folder onto a device: config.json, model.safetensors (or shards),
+    /// tokenizer.json.
     pub fn load(directory: &Path, device: DeviceName) -> Result<Vla> {
         let device = device.open()?;
         Vla::load_on(directory, &device, Backend::for_device(&device))
     }
 
-    /// Loads it onto an open device, computing as told.
+    /// Loads a checkpoint folder onto an open device, with the given backend.
     pub fn load_on(directory: &Path, device: &Device, backend: Backend) -> Result<Vla> {
         let load = || -> Result<Vla> {
             let parser = CompletionParser::load(directory)?;
@@ -55,12 +56,12 @@ impl Vla {
         load().with_context(|| format!("cannot load the policy in {}", directory.display()))
     }
 
-    /// Reads completions of this checkpoint.
+    /// The parser of this checkpoint's completions.
     pub fn parser(&self) -> &CompletionParser {
         &self.parser
     }
 
-    /// Samples the candidates of every request; all requests share the network's products. Blocks while it computes.
+    /// Samples candidates for all requests in one batch. Blocks the calling thread.
     pub fn propose_now(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
         if requests.is_empty() {
             return Ok(Vec::new());
@@ -101,7 +102,7 @@ impl Vla {
         Ok(proposals)
     }
 
-    /// Outputs of every layer by the checkpoint's names, then `logits` of all positions.
+    /// Outputs of every layer under the checkpoint's names, then the `logits` of all positions.
     pub fn activations(&self, image: &Image, ids: &[u32]) -> Result<Vec<(String, Tensor)>> {
         self.check_image(image)?;
         let mut trace = Trace::on();
@@ -111,7 +112,8 @@ impl Vla {
         Ok(trace.into_outputs()?)
     }
 
-    /// Times prefill and steps of these requests, for so many tokens of every candidate.
+    /// Measures the time of prefill and decode steps of these requests, with `tokens` tokens per
+    /// candidate.
     pub fn time(&self, requests: &[ProposalRequest<'_>], tokens: usize) -> Result<Timings> {
         let prompts = requests.iter().map(|request| self.check(request));
         let prompts: Vec<Vec<u32>> = prompts.collect::<Result<_>>()?;
@@ -124,19 +126,19 @@ impl Vla {
         timings::measure(&self.network, &contexts, candidates, tokens)
     }
 
-    /// Bytes of weights that one token step reads, whatever the number of rows.
+    /// Bytes of weights that one decode step reads, independent of the number of rows.
     pub fn step_bytes(&self) -> usize {
         self.network.decoder.step_bytes()
     }
 
-    /// Tokens that may follow a prompt of so many ids and the image.
+    /// Maximum number of tokens after a prompt of this length and the image.
     fn tokens_max(&self, prompt_ids: usize) -> usize {
         let side = self.parser.config.towers[0].side();
         let room = self.network.decoder.positions_max().saturating_sub(prompt_ids + side * side);
         self.parser.config.completion_tokens_max.min(room)
     }
 
-    /// The prompt of a request that can be answered.
+    /// Checks a request and returns its prompt.
     fn check(&self, request: &ProposalRequest<'_>) -> Result<Vec<u32>> {
         self.check_image(request.image)?;
         ensure!(request.candidates > 0, "candidates: expected at least 1, got 0");
@@ -152,7 +154,7 @@ impl Vla {
         let (height, width) = self.info.image_size;
         ensure!(
             (image.height, image.width) == (height, width),
-            "image: expected {height} x {width} pixels, got {} x {}; ask the server for that size",
+            "image: expected {height} x {width} pixels, got {} x {}; request images of that size from the server",
             image.height,
             image.width
         );
@@ -172,7 +174,7 @@ impl Policy for Vla {
         &self.info
     }
 
-    /// Computes in the calling thread and on all cores, or on one core beside other calls.
+    /// Computes in the calling thread: on all cores, or on one core if other calls are running.
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
         self.propose_now(requests)
     }

@@ -1,4 +1,4 @@
-//! tasks.toml and the scenes: those of a folder, or those that the program was built with.
+//! tasks.toml and the scenes, from a folder or built into the program.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use include_dir::{Dir, include_dir};
 
 static BUILT_IN: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/../assets");
 
-/// Where they are read from.
+/// Where the assets are read from.
 #[derive(Debug, Clone)]
 pub enum Assets {
     Folder(PathBuf),

@@ -1,4 +1,4 @@
-//! The camera: RGB images from an offscreen OpenGL context without a window.
+//! The camera: RGB images from an off-screen OpenGL context without a window.
 
 use std::cell::OnceCell;
 use std::ffi::{CStr, c_char, c_void};
@@ -14,25 +14,27 @@ use crate::fault::Fault;
 
 type Egl = egl::DynamicInstance<egl::EGL1_5>;
 
-/// A variable of the environment and its value: Mesa's software renderer draws in the thread that asks. Handing a small
-/// picture to threads of its own takes as long as drawing it, and servers share a machine by processes.
+/// An environment variable and its value: Mesa's software renderer renders in the calling thread.
+/// Passing a small image to its own threads takes as long as rendering it, and servers use several
+/// processes for parallelism.
 pub const DRAWING_THREADS: (&str, &str) = ("LP_NUM_THREADS", "0");
 const GEOMS_MAX: usize = 200;
-/// Metres, for what is rounded on the way to a pixel.
+/// Margin for rounding, in metres.
 const EDGE_MARGIN: f32 = 1e-3;
-/// Of EGL_EXT_platform_device: a display of a graphics device, without a window system.
+/// From EGL_EXT_platform_device: a display of a graphics device, without a window system.
 const PLATFORM_DEVICE: egl::Enum = 0x313F;
 const DEVICES_MAX: usize = 16;
-/// Of EGL_EXT_device_query: the extensions of a device, and the one of Mesa's software renderer.
+/// From EGL_EXT_device_query: the query for a device's extensions, and the extension of Mesa's
+/// software renderer.
 const EXTENSIONS: egl::Int = 0x3055;
 const SOFTWARE_DEVICE: &[u8] = b"EGL_MESA_device_software";
 
-/// One fixed camera; the model, not the image's shape, sets its field of view. With 0 x 0 pixels it
-/// renders nothing, and needs no OpenGL. Use it in the thread that made it.
+/// One fixed camera. Its field of view is set by the model and not by the image's shape. With 0 x 0
+/// pixels it renders nothing and needs no OpenGL. Use it only in the thread that created it.
 pub struct Camera(Option<Renderer>);
 
 struct Renderer {
-    /// Freed first, while its context exists.
+    /// Freed before its OpenGL context.
     context: Option<MjrContext>,
     scene: MjvScene,
     option: MjvOption,
@@ -41,14 +43,14 @@ struct Renderer {
     offscreen: Offscreen,
 }
 
-/// An OpenGL context that draws into MuJoCo's own buffer.
+/// An OpenGL context that renders into MuJoCo's buffer.
 struct Offscreen {
     display: Rc<Display>,
     context: egl::Context,
 }
 
-/// libEGL and the display of Mesa's software device, or else of the first device that works; the same for all cameras
-/// of a thread.
+/// libEGL and the display of Mesa's software device, or of the first working device if there is
+/// none. All cameras of a thread share it.
 struct Display {
     egl: Egl,
     display: egl::Display,
@@ -66,7 +68,7 @@ impl Camera {
         Ok(Camera(renderer.transpose()?))
     }
 
-    /// What the camera sees now.
+    /// Renders the current state.
     pub fn image(&mut self, data: &mut MjData<Arc<MjModel>>) -> Result<Image, Fault> {
         match &mut self.0 {
             Some(renderer) => renderer.image(data),
@@ -113,7 +115,7 @@ impl Renderer {
     }
 
     fn image(&mut self, data: &mut MjData<Arc<MjModel>>) -> Result<Image, Fault> {
-        // Several worlds may live in one process: each makes its own context current first.
+        // A process may have several environments: each one makes its own context current first.
         self.offscreen.make_current().map_err(Fault::RendererUnavailable)?;
         let Some(context) = &self.context else {
             return Err(Fault::RendererUnavailable("the renderer was freed".to_owned()));
@@ -134,13 +136,13 @@ impl Renderer {
     }
 }
 
-/// Takes shapes beyond the picture's edges out of the scene: no pixel changes, and OpenGL's work does.
+/// Removes shapes outside the image from the scene. This changes no pixel and saves OpenGL work.
 fn keep_inside(scene: &mut MjvScene) {
-    // SAFETY: shapes are only put into another order, and fewer counted.
+    // SAFETY: this only reorders the shapes and reduces their count.
     let scene = unsafe { scene.ffi_mut() };
     let [left_eye, right_eye] = &scene.camera;
     let camera = left_eye;
-    // MuJoCo draws from between the eyes unless the picture is stereoscopic.
+    // MuJoCo renders from the midpoint between the eyes unless the image is stereoscopic.
     let position: [f32; 3] =
         std::array::from_fn(|axis| f32::midpoint(left_eye.pos[axis], right_eye.pos[axis]));
     let (forward, up) = (camera.forward, camera.up);
@@ -152,7 +154,7 @@ fn keep_inside(scene: &mut MjvScene) {
     let dot = |left: [f32; 3], right: [f32; 3]| -> f32 {
         left.iter().zip(right).map(|(left, right)| left * right).sum()
     };
-    // Half of the picture's width and height at the distance of 1 m.
+    // Half of the image's width and height at a distance of 1 m.
     let wide = camera.frustum_width / camera.frustum_near;
     let high = camera.frustum_top / camera.frustum_near;
     let is_outside = |geom: &mujoco_rs::mujoco_c::mjvGeom| {
@@ -160,11 +162,11 @@ fn keep_inside(scene: &mut MjvScene) {
         let depth = dot(offset, forward);
         let beyond = |across: f32, slope: f32| (across.abs() - slope * depth) / slope.hypot(1.0);
         let beyond = [beyond(dot(offset, right), wide), beyond(dot(offset, up), high), -depth];
-        // A bounding radius of 0 stands for a shape without end.
+        // A bounding radius of 0 means an infinite shape.
         let radius = geom.modelrbound;
         radius > 0.0 && beyond.iter().any(|distance| *distance > radius + EDGE_MARGIN)
     };
-    // SAFETY: MuJoCo has filled that many shapes, which nobody else uses now.
+    // SAFETY: MuJoCo has filled this number of shapes, and nothing else uses them now.
     let geoms = unsafe { std::slice::from_raw_parts_mut(scene.geoms, scene.ngeom as usize) };
     let mut kept = 0;
     for index in 0..geoms.len() {
@@ -178,7 +180,7 @@ fn keep_inside(scene: &mut MjvScene) {
 
 impl Drop for Renderer {
     fn drop(&mut self) {
-        // Without its context current, freeing would free another camera's buffers.
+        // Freeing without its own context current would free another camera's buffers.
         if self.offscreen.make_current().is_ok() {
             self.context.take();
         } else {
@@ -188,7 +190,7 @@ impl Drop for Renderer {
 }
 
 impl Offscreen {
-    /// Makes a context, and makes it current.
+    /// Creates a context and makes it current.
     fn new() -> Result<Offscreen, String> {
         let shared = Display::of_this_thread()?;
         let Display { egl, display } = &*shared;
@@ -226,7 +228,7 @@ impl Offscreen {
 impl Drop for Offscreen {
     fn drop(&mut self) {
         let Display { egl, display } = &*self.display;
-        // A context that cannot be freed goes with the process.
+        // A context that cannot be freed is freed with the process.
         let _ = egl.make_current(*display, None, None, None);
         let _ = egl.destroy_context(*display, self.context);
     }
@@ -247,13 +249,13 @@ impl Display {
     }
 
     fn open() -> Result<Display, String> {
-        // SAFETY: loading libEGL runs its initialisers, which is what it is for.
+        // SAFETY: loading libEGL runs its initialisers, as intended.
         let egl = unsafe { Egl::load_required() }
-            .map_err(|error| format!("no libEGL.so.1 with EGL 1.5: {error}"))?;
+            .map_err(|error| format!("cannot load libEGL.so.1 with EGL 1.5: {error}"))?;
         let mut devices = devices(&egl)?;
-        // Images must not depend on the graphics card that a machine may have.
+        // Images must not depend on the machine's GPU.
         devices.sort_by_key(|device| !is_software(&egl, *device));
-        let mut reason = "no device".to_owned();
+        let mut reason = "found no EGL device".to_owned();
         for device in devices {
             // SAFETY: the device was listed by this library.
             let display =
@@ -263,7 +265,7 @@ impl Display {
                 Err(error) => reason = error.to_string(),
             }
         }
-        Err(format!("no device display: {reason}"))
+        Err(format!("cannot open a display of an EGL device: {reason}"))
     }
 }
 
@@ -273,7 +275,7 @@ fn devices(egl: &Egl) -> Result<Vec<*mut c_void>, String> {
     let query = egl
         .get_proc_address("eglQueryDevicesEXT")
         .ok_or("libEGL has no eglQueryDevicesEXT: expected EGL_EXT_device_enumeration")?;
-    // SAFETY: EGL_EXT_device_enumeration gives the function of this name this type.
+    // SAFETY: EGL_EXT_device_enumeration defines this function with this type.
     let query: QueryDevices = unsafe { std::mem::transmute(query) };
     let mut devices = vec![std::ptr::null_mut(); DEVICES_MAX];
     let mut count = 0;
@@ -289,14 +291,14 @@ fn devices(egl: &Egl) -> Result<Vec<*mut c_void>, String> {
 fn is_software(egl: &Egl, device: *mut c_void) -> bool {
     type QueryString = unsafe extern "system" fn(*mut c_void, egl::Int) -> *const c_char;
     let Some(query) = egl.get_proc_address("eglQueryDeviceStringEXT") else { return false };
-    // SAFETY: EGL_EXT_device_query gives the function of this name this type.
+    // SAFETY: EGL_EXT_device_query defines this function with this type.
     let query: QueryString = unsafe { std::mem::transmute(query) };
     // SAFETY: the device was listed by this library.
     let extensions = unsafe { query(device, EXTENSIONS) };
     if extensions.is_null() {
         return false;
     }
-    // SAFETY: EGL returns a text that ends with a zero and lives as long as the library.
+    // SAFETY: EGL returns a zero-terminated text that lives as long as the library.
     let extensions = unsafe { CStr::from_ptr(extensions) };
     extensions.to_bytes().split(|byte| *byte == b' ').any(|name| name == SOFTWARE_DEVICE)
 }

@@ -1,7 +1,7 @@
-//! The controller: end-effector delta target with inverse kinematics, as in SIMPLER.
+//! The controller: end-effector delta targets with inverse kinematics, as in SIMPLER.
 //!
-//! Only MuJoCo's own functions and element-wise arithmetic are used, in the order of the Python server, so that both
-//! compute the same bits.
+//! It uses only MuJoCo's functions and element-wise arithmetic in the same order as the Python
+//! server, so that both compute the same bits.
 
 use std::sync::Arc;
 
@@ -12,10 +12,11 @@ use mujoco_rs::wrappers::fun::utility::*;
 use crate::model::{Names, Vector};
 use crate::tasks::{InverseKinematics, Task};
 
-/// Joints of the arm.
+/// Number of arm joints.
 pub const ARM_JOINTS: usize = 6;
 
-/// Turns actions into joint targets; its state is the commanded pose of the tool centre point.
+/// Converts actions to joint targets; its state is the commanded pose of the tool centre point
+/// (TCP).
 pub struct Controller {
     scratch: MjData<Arc<MjModel>>,
     settings: InverseKinematics,
@@ -27,7 +28,7 @@ pub struct Controller {
     pub commanded: Pose,
 }
 
-/// World frame: position in metres, unit quaternion wxyz.
+/// In the world frame: position in metres, unit quaternion wxyz.
 #[derive(Debug, Clone, Copy)]
 pub struct Pose {
     pub position: Vector,
@@ -49,7 +50,7 @@ impl Controller {
         }
     }
 
-    /// The commanded pose starts at the measured one.
+    /// Sets the commanded pose to the measured one.
     pub fn reset(&mut self, data: &MjData<Arc<MjModel>>) {
         let mut quaternion = [0.0; 4];
         mju_mat_2_quat(&mut quaternion, &data.site_xmat()[self.site]);
@@ -58,7 +59,7 @@ impl Controller {
 
     /// Moves the commanded pose by the action and returns arm joint targets in rad.
     ///
-    /// The translation is in the base frame; the rotation vector is too, about the current
+    /// Translation and rotation vector are in the base frame; the rotation is about the current
     /// tool centre point: p = p_now + dp + dR (p_commanded - p_now), R = dR R_commanded.
     pub fn joint_target(
         &mut self,
@@ -88,7 +89,8 @@ impl Controller {
         self.solve(data)
     }
 
-    /// Damped least squares from the measured joints; unreachable targets keep the measured.
+    /// Damped least squares from the measured joints; for an unreachable target the joints stay as
+    /// measured.
     fn solve(&mut self, data: &MjData<Arc<MjModel>>) -> [f64; ARM_JOINTS] {
         self.scratch.qpos_mut().copy_from_slice(data.qpos());
         let damping = self.settings.damping * self.settings.damping;
@@ -121,7 +123,8 @@ impl Controller {
         self.positions.map(|position| self.scratch.qpos()[position])
     }
 
-    /// Of the tool centre point by the arm's joints: three rows of translation, three of rotation.
+    /// Jacobian of the tool centre point with respect to the arm joints: three rows of translation,
+    /// three of rotation.
     fn jacobian(&mut self) -> [f64; 6 * ARM_JOINTS] {
         self.scratch.com_pos();
         let (translation, rotation) = self.scratch.jac_site(true, true, self.site);
@@ -136,7 +139,7 @@ impl Controller {
         jacobian
     }
 
-    /// Commanded minus scratch pose, world frame: metres (3) and rotation vector in rad (3).
+    /// Commanded minus scratch pose in the world frame: metres (3) and rotation vector in rad (3).
     fn residual(&mut self) -> [f64; 6] {
         self.scratch.kinematics();
         let now = self.scratch.site_xpos()[self.site];

@@ -1,27 +1,27 @@
-//! What can go wrong in the world: each fault is its own and never a reward.
+//! Faults of the environment. A fault is never a reward.
 
 use protocol::FaultKind;
 use thiserror::Error;
 
-/// Why the world did not do what was asked; the words are those of the Python server.
+/// Why a request failed. The texts are those of the Python server.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum Fault {
-    /// The request is wrong at this moment, and the world is unchanged.
+    /// The request is invalid now; the environment is unchanged.
     #[error("{0}")]
     Wrong(String),
     /// Positions or velocities became non-finite or impossibly large.
     #[error("{0}")]
     PhysicsDiverged(String),
-    /// No OpenGL context could be made.
+    /// No OpenGL context could be created.
     #[error("{0}")]
     RendererUnavailable(String),
-    /// A scene or the description of the tasks is not what this program reads.
+    /// A scene or the description of the tasks is invalid.
     #[error("{0}")]
     Internal(String),
 }
 
 impl Fault {
-    /// How the protocol calls it; none when it is a refusal and no fault of the world.
+    /// The kind in the protocol; `None` for a refused request.
     pub fn kind(&self) -> Option<FaultKind> {
         match self {
             Fault::Wrong(_) => None,

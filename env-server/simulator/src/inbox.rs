@@ -1,6 +1,7 @@
-//! What waits for the simulation thread: bounded for each session, and taken from each in turn.
+//! The queue of the simulation thread: bounded for each session and processed round-robin.
 //!
-//! zenoh's threads only put, and never wait. A session's own flood fills its own queue and nobody else's.
+//! zenoh's threads only add to it and never wait. A session that sends too much fills only its own
+//! queue.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -10,18 +11,18 @@ use protocol::{CodecError, Request, codec};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
-/// Requests of one session; its holder has one at a time and sends again what is dropped.
+/// Requests per session. A holder has one request at a time and repeats it if it is dropped.
 const REQUESTS_MAX: usize = 4;
-/// Queries for all sessions together.
+/// Queries of all agents together.
 const QUERIES_MAX: usize = 64;
 
-/// Something to do.
+/// A unit of work.
 pub enum Work {
     /// A query on `describe`.
     Describe(Query),
     /// A query on `open`.
     Open(Query),
-    /// A session's request, or why its bytes were not kept.
+    /// A session's request, or why its bytes were rejected.
     Request { session: String, bytes: Result<Vec<u8>, CodecError> },
 }
 
@@ -36,7 +37,7 @@ pub struct Inbox {
 struct Waiting {
     queries: VecDeque<Work>,
     requests: HashMap<String, VecDeque<Result<Vec<u8>, CodecError>>>,
-    /// Each source that has something waiting, once.
+    /// Each source with waiting work, exactly once.
     turns: VecDeque<Source>,
 }
 
@@ -46,17 +47,17 @@ enum Source {
 }
 
 impl Inbox {
-    /// From now on the session's requests are kept.
+    /// Starts accepting the session's requests.
     pub fn admit(&self, session: &str) {
         self.waiting().requests.insert(session.to_owned(), VecDeque::new());
     }
 
-    /// They are no longer.
+    /// Stops accepting the session's requests.
     pub fn forget(&self, session: &str) {
         self.waiting().requests.remove(session);
     }
 
-    /// Copies a request, unless it is too large or too many wait.
+    /// Copies a request unless it is too large or the session's queue is full.
     pub fn put_request(&self, session: &str, payload: &ZBytes) {
         let waiting = &mut *self.waiting();
         let Some(requests) = waiting.requests.get_mut(session) else { return };
@@ -71,7 +72,7 @@ impl Inbox {
         self.arrived.notify_one();
     }
 
-    /// A query on `describe` or `open`; given back where too many wait.
+    /// Adds a query on `describe` or `open`; returns it if the queue is full.
     pub fn put_query(&self, work: Work) -> Option<Work> {
         let mut waiting = self.waiting();
         if waiting.queries.len() >= QUERIES_MAX {
@@ -85,7 +86,7 @@ impl Inbox {
         None
     }
 
-    /// What is next, waited for until `deadline`.
+    /// The next unit of work, or `None` if there is none until `deadline`.
     pub fn take(&self, deadline: Instant) -> Option<Work> {
         let mut waiting = self.waiting();
         loop {
@@ -115,7 +116,7 @@ impl Waiting {
                     return work;
                 }
                 Source::Session(session) => {
-                    // One that has ended meanwhile has none.
+                    // A session that has ended has no queue.
                     let Some(requests) = self.requests.get_mut(&session) else { continue };
                     let Some(bytes) = requests.pop_front() else { continue };
                     if !requests.is_empty() {

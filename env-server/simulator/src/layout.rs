@@ -1,4 +1,5 @@
-//! Initial layouts: the 24 of the published grid, and random ones that stay clear of them.
+//! Initial layouts: the 24 layouts of the published grid, and random ones with a distance from
+//! them.
 
 use protocol::limits::SEED_END;
 
@@ -7,7 +8,7 @@ use crate::tasks::{Layout, Pose, Task};
 
 const DRAWS_MAX: usize = 10_000;
 
-/// Steele, Lea and Flood's generator: one 64-bit word of state, the same in every language.
+/// The generator by Steele, Lea and Flood: one 64-bit word of state, the same in every language.
 struct SplitMix64 {
     state: u64,
 }
@@ -21,13 +22,13 @@ impl SplitMix64 {
         word ^ (word >> 31)
     }
 
-    /// low + (high - low) u with u in [0, 1) on a grid of 2^-53.
+    /// low + (high - low) u, with u in [0, 1) in steps of 2^-53.
     fn uniform(&mut self, [low, high]: [f64; 2]) -> f64 {
         low + (high - low) * ((self.next_word() >> 11) as f64 / (1u64 << 53) as f64)
     }
 }
 
-/// The layout of one reset: a grid layout, or a draw from the seed.
+/// The initial layout of a reset: a grid layout, or a random one from the seed.
 pub fn place(task: &Task, layout: Option<u32>, seed: u64) -> Result<Layout, Fault> {
     if seed >= SEED_END {
         return Err(Fault::Wrong(format!("seed {seed}: expected 0 <= seed < 2^53")));
@@ -57,7 +58,8 @@ fn draw(task: &Task, seed: u64) -> Result<Layout, Fault> {
         };
         let apart = distance(layout.source_x - layout.target_x, layout.source_y - layout.target_y);
         if apart >= ranges.separation_min && !is_near_grid_layout(task, &layout) {
-            // After source and target, which are then where they are without distractors.
+            // Distractors are drawn last, so that source and target are the same as without
+            // distractors.
             layout.distractors = draw_distractors(task, &layout, &mut generator, seed)?;
             return Ok(layout);
         }
@@ -96,7 +98,7 @@ fn draw_distractors(
     Ok(poses)
 }
 
-/// Whether source, target and yaw are all within the excluded distance of one layout.
+/// Whether source, target and yaw are all within the exclusion distances of one grid layout.
 fn is_near_grid_layout(task: &Task, layout: &Layout) -> bool {
     let ranges = &task.rule.random;
     let radius = ranges.exclusion_radius;
@@ -107,14 +109,16 @@ fn is_near_grid_layout(task: &Task, layout: &Layout) -> bool {
     })
 }
 
-/// 64-bit FNV-1a: mixes the task's name into the stream, so that tasks do not share draws.
+/// 64-bit FNV-1a: mixes the task's name into the stream, so that tasks have different random
+/// numbers.
 fn fnv1a(text: &str) -> u64 {
     let mix = |digest: u64, byte| (digest ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
     text.bytes().fold(0xCBF2_9CE4_8422_2325, mix)
 }
 
 fn distance(x: f64, y: f64) -> f64 {
-    // Square root of plain products: correctly rounded, so equal in every language (hypot is not).
+    // Square root of plain products: it is correctly rounded and thus equal in every language,
+    // unlike hypot.
     (x * x + y * y).sqrt()
 }
 

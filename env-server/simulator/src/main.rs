@@ -1,10 +1,10 @@
-//! `rever-simulator`: the world of `rever_env`, natively and behind the same protocol.
+//! `rever-simulator`: the native simulator, with the same protocol and environments as `rever_env`.
 //!
 //! ```text
-//! serving     the network, and how it ends       trace     every number of an episode, to be compared
+//! serving     network, start and shutdown        trace     all numbers of an episode
 //!   server    leases, heartbeat                  session   numbered requests, slots
-//!     inbox, outbox       what waits for the simulation thread, and what it sends
-//!   worlds    idle worlds                        world     one task in MuJoCo: reset, step, save, restore
+//!     inbox, outbox       queues to and from the simulation thread
+//!   worlds    idle environments                  world     one task in MuJoCo: reset, step, save, restore
 //!     mjcf, model, controller, success, expert, layout, camera    tasks, assets   tasks.toml and the scenes
 //! ```
 
@@ -53,13 +53,14 @@ enum Command {
     Trace(trace::Arguments),
 }
 
-/// What zenoh logs below an error names the places in its sources, which are paths of the machine that built it.
+/// zenoh's log messages below the level error contain source locations, which are paths on the
+/// machine that built the program.
 const LOG_FILTER: &str = "info,zenoh=error,zenoh_transport=off,zenoh_link=off,zenoh_link_tcp=off";
 
 fn main() -> ExitCode {
     let (name, value) = camera::DRAWING_THREADS;
     if std::env::var_os(name).is_none() {
-        // SAFETY: no other thread runs yet that could read the environment.
+        // SAFETY: no other thread that could read the environment runs yet.
         unsafe { std::env::set_var(name, value) };
     }
     let program = Program::parse();

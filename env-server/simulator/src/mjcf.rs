@@ -1,4 +1,4 @@
-//! A task's scene in MuJoCo's XML: its includes in place, and what the task changes in it.
+//! Composes a task's scene in MuJoCo's XML: resolves includes and applies the task's changes.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use xmltree::{Element, XMLNode};
 use crate::assets::Assets;
 use crate::tasks::Task;
 
-/// The scene as one text, for MuJoCo's compiler.
+/// The scene as one text for MuJoCo's compiler.
 pub fn scene(task: &Task) -> Result<String> {
     let mut root = included(&task.assets, &task.rule.scene)?;
     for (element, names) in &task.rule.mjcf {
@@ -26,9 +26,9 @@ pub fn scene(task: &Task) -> Result<String> {
     Ok(String::from_utf8(text)?)
 }
 
-/// Changes every element of that kind and name and counts them.
+/// Changes every element of this kind and name, and returns their number.
 ///
-/// One without a name, as a body's inertial is, goes by its parent's.
+/// An element without a name, such as a body's inertial, is found by its parent's name.
 fn change(
     node: &mut Element,
     parent: Option<&str>,
@@ -53,13 +53,16 @@ fn included(assets: &Assets, name: &str) -> Result<Element> {
     Ok(root)
 }
 
-/// Puts the content of other files in the place of include elements.
+/// Replaces include elements by the content of their files.
 fn include(node: &mut Element, assets: &Assets) -> Result<()> {
     let mut children = Vec::new();
     for child in std::mem::take(&mut node.children) {
         match child {
             XMLNode::Element(element) if element.name == "include" => {
-                let file = element.attributes.get("file").context("an include without a file")?;
+                let file = element
+                    .attributes
+                    .get("file")
+                    .context("an include element has no file attribute")?;
                 children.extend(included(assets, file)?.children);
             }
             XMLNode::Element(mut element) => {

@@ -1,4 +1,4 @@
-//! A scene as MuJoCo compiled it, and the numbers of what tasks.toml names in it.
+//! A compiled scene and the indices of its elements named in tasks.toml.
 
 use std::sync::Arc;
 
@@ -8,10 +8,10 @@ use crate::fault::Fault;
 use crate::mjcf;
 use crate::tasks::Task;
 
-/// Metres or newtons, world frame.
+/// In the world frame, in metres or newtons.
 pub type Vector = [f64; 3];
 
-/// Numbers of bodies, joints, actuators, a site and a camera.
+/// Indices of bodies, joints, actuators, a site and a camera.
 #[derive(Debug, Clone)]
 pub struct Names {
     pub source: usize,
@@ -24,7 +24,7 @@ pub struct Names {
     pub arm_actuators: [usize; 6],
     pub finger_joints: [usize; 2],
     pub finger_actuators: [usize; 2],
-    /// Free joints of source and target; none where it does not move.
+    /// Free joints of source and target; `None` for a target that does not move.
     pub source_joint: usize,
     pub target_joint: Option<usize>,
     pub distractors: Vec<usize>,
@@ -40,7 +40,7 @@ pub fn compile(task: &Task) -> Result<(Arc<MjModel>, Names), Fault> {
     let timestep = model.opt().timestep;
     if timestep != task.settings.timestep {
         return Err(Fault::Internal(format!(
-            "{}: expected the time step of tasks.toml, {}, got {timestep}",
+            "{}: expected the time step of tasks.toml ({}), got {timestep}",
             task.rule.scene, task.settings.timestep
         )));
     }
@@ -53,7 +53,7 @@ fn names(model: &MjModel, task: &Task) -> Result<Names, Fault> {
     let find = |kind: MjtObj, name: &str| {
         model.name_to_id(kind, name).ok_or_else(|| {
             Fault::Internal(format!(
-                "{}: expected {name:?} in it, got none ({kind:?})",
+                "{}: expected an element {name:?} ({kind:?}), got none",
                 task.rule.scene
             ))
         })

@@ -1,5 +1,5 @@
-//! What leaves the server, sent by other threads than the simulation's: zenoh makes a sender wait for a peer that stops
-//! reading, up to a minute, and nobody else may wait with it.
+//! Sends the server's messages from separate threads. zenoh makes a sender wait up to a minute for
+//! a peer that stops reading, and neither the simulation nor other sessions may wait with it.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
@@ -13,14 +13,14 @@ use zenoh::Wait;
 use zenoh::pubsub::Publisher;
 use zenoh::query::Query;
 
-/// Threads that answer queries at one time; almost always there is none.
+/// Maximum number of threads that answer queries; normally there is none.
 const ANSWERING_MAX: usize = 64;
-/// Queries that wait for their end unanswered, and what they hold: more than ordinary use brings in the minute until zenoh
-/// closes the link of a peer that stopped reading.
+/// Limits of the queries that wait to be dropped without an answer: more than normal use produces
+/// in the minute until zenoh closes the link of a peer that stopped reading.
 const DISCARDED_MAX: usize = 16_384;
 const DISCARDED_BYTES_MAX: usize = 32 << 20;
 
-/// A session's replies. Dropping it ends its thread after the last one.
+/// The replies of a session. Dropping it ends its thread after the last reply.
 pub struct Outbox(Arc<Slot>);
 
 #[derive(Default)]
@@ -36,14 +36,14 @@ struct Next {
 }
 
 impl Outbox {
-    /// Starts the thread that sends by `publisher`.
+    /// Starts the thread that sends with `publisher`.
     pub fn new(publisher: Publisher<'static>) -> Result<Outbox> {
         let slot = Arc::new(Slot::default());
         let sent = Arc::clone(&slot);
         let send = move || {
             while let Some(reply) = sent.wait() {
                 if let Err(error) = publisher.put(reply).wait() {
-                    tracing::warn!("a reply was not sent: {}", transport::in_words(error));
+                    tracing::warn!("cannot send a reply: {}", transport::in_words(error));
                 }
             }
         };
@@ -54,7 +54,8 @@ impl Outbox {
         Ok(Outbox(slot))
     }
 
-    /// Sends a reply in the place of one that still waits: its holder asks again for what it misses.
+    /// Sends a reply, replacing one that is still waiting: its holder requests a missing reply
+    /// again.
     pub fn send(&self, reply: Bytes) {
         self.0.next().reply = Some(reply);
         self.0.changed.notify_one();
@@ -69,7 +70,7 @@ impl Drop for Outbox {
 }
 
 impl Slot {
-    /// The next reply; none after the last one.
+    /// The next reply; `None` after the last one.
     fn wait(&self) -> Option<Bytes> {
         let mut next = self.next();
         loop {
@@ -88,7 +89,7 @@ impl Slot {
     }
 }
 
-/// Answers to queries. zenoh tells the asker of a query's end when it is dropped, which may wait, too.
+/// Answers queries. Dropping a query sends its end to the peer, which may also wait.
 #[derive(Clone)]
 pub struct Answers {
     answering: Arc<AtomicUsize>,
@@ -97,7 +98,7 @@ pub struct Answers {
 }
 
 impl Answers {
-    /// Starts the thread that ends queries unanswered.
+    /// Starts the thread that drops queries without an answer.
     pub fn new() -> Result<Answers> {
         let (discarded, queries) = sync_channel::<Query>(DISCARDED_MAX);
         let discarded_bytes = Arc::new(AtomicUsize::new(0));
@@ -116,7 +117,8 @@ impl Answers {
         Ok(Answers { answering: Arc::default(), discarded, discarded_bytes })
     }
 
-    /// Answers on a thread of its own; drops the query where too many answers wait for their readers.
+    /// Answers in a separate thread; drops the query if too many answers are waiting for their
+    /// readers.
     pub fn send(&self, query: Query, key: String, bytes: Vec<u8>) {
         if self.answering.fetch_add(1, Ordering::Relaxed) >= ANSWERING_MAX {
             self.answering.fetch_sub(1, Ordering::Relaxed);
@@ -125,29 +127,29 @@ impl Answers {
         let answering = Arc::clone(&self.answering);
         let answer = move || {
             if let Err(error) = query.reply(key, bytes).wait() {
-                tracing::warn!("a query was not answered: {}", transport::in_words(error));
+                tracing::warn!("cannot answer a query: {}", transport::in_words(error));
             }
             drop(query);
             answering.fetch_sub(1, Ordering::Relaxed);
         };
         if let Err(error) = thread::Builder::new().name("answer".to_owned()).spawn(answer) {
             self.answering.fetch_sub(1, Ordering::Relaxed);
-            tracing::warn!("a query was not answered: cannot start a thread: {error}");
+            tracing::warn!("cannot answer a query: cannot start a thread: {error}");
         }
     }
 
-    /// Ends a query unanswered without waiting.
+    /// Drops a query without an answer and without waiting.
     pub fn discard(&self, query: Query) {
         let size = size(&query);
         let held = self.discarded_bytes.fetch_add(size, Ordering::Relaxed);
-        // Beyond the limits nothing is left but to wait for the peer that reads none of so many ends.
+        // Beyond these limits the query is dropped here and may wait for its peer.
         if held > DISCARDED_BYTES_MAX || self.discarded.try_send(query).is_err() {
             self.discarded_bytes.fetch_sub(size, Ordering::Relaxed);
         }
     }
 }
 
-/// Bytes of a query's payload.
+/// Size of a query's payload in bytes.
 pub fn size(query: &Query) -> usize {
     query.payload().map_or(0, |payload| payload.len())
 }

@@ -1,7 +1,7 @@
-//! Sessions over zenoh, all stepped by one thread: the one that owns the rendering contexts.
+//! Sessions over zenoh, all stepped by one thread, which owns the rendering contexts.
 //!
-//! callback -> inbox -> simulation thread -> session -> outbox: neither zenoh's threads nor the simulation thread wait
-//! for a peer.
+//! callback -> inbox -> simulation thread -> session -> outbox. Neither zenoh's threads nor the
+//! simulation thread wait for a peer.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -26,21 +26,21 @@ use crate::session::{Session, refused};
 use crate::worlds::Worlds;
 
 const BEAT: Duration = Duration::from_millis(500);
-/// A session without its holder's token: the link may come back.
+/// How long a session lives without its holder's token: the connection may be restored.
 const HOLDER_WAIT_MAX: Duration = Duration::from_secs(10);
-/// A closed session still answers: its last reply may have been lost.
+/// How long a closed session still answers, because its last reply may have been lost.
 const CLOSED_WAIT_MAX: Duration = Duration::from_secs(10);
 
-/// What a server offers.
+/// Options of a server.
 #[derive(Debug, Clone)]
 pub struct ServerOptions {
     /// Peers see each other only within the same fleet.
     pub fleet: String,
-    /// At once.
+    /// Maximum number of concurrent sessions.
     pub sessions_max: u32,
 }
 
-/// Serves in the thread that calls `run`.
+/// A server that runs in the thread that calls `run`.
 pub struct Server<'a> {
     id: String,
     network: &'a Network,
@@ -53,13 +53,13 @@ pub struct Server<'a> {
     answers: Answers,
 }
 
-/// A session with what zenoh holds for it.
+/// A session with its zenoh declarations.
 struct Lease {
     opened_for: String,
     session: Session,
     opened_at: Instant,
     closed_at: Option<Instant>,
-    /// zenoh's threads write it.
+    /// Written by zenoh's threads.
     holder: Arc<Mutex<Holder>>,
     outbox: Outbox,
     _requests: Subscriber<()>,
@@ -87,12 +87,12 @@ impl<'a> Server<'a> {
             inbox: Arc::default(),
             answers: Answers::new()?,
         };
-        // What cannot be described is refused now.
+        // Fail now if the description exceeds the protocol's limits.
         encode(&server.description())?;
         Ok(server)
     }
 
-    /// Declares everything, the liveliness token last; then works until `stop` is set.
+    /// Declares everything, the liveliness token last, and serves until `stop` is set.
     pub fn run(mut self, stop: &AtomicBool, ready: impl FnOnce(&str) -> Result<()>) -> Result<()> {
         let network = self.network;
         let _describe = self.queryable(self.keys.describe(&self.id)?, Work::Describe)?;
@@ -124,7 +124,8 @@ impl<'a> Server<'a> {
         Ok(())
     }
 
-    /// Leaves the queries on `key` to the simulation thread, refuses what is too large and drops what is too much.
+    /// Passes queries on `key` to the simulation thread; refuses queries that are too large and
+    /// drops those beyond the limit.
     fn queryable(&self, key: String, work: fn(Query) -> Work) -> Result<Queryable<()>> {
         let (inbox, answers) = (Arc::clone(&self.inbox), self.answers.clone());
         let of = key.clone();
@@ -133,7 +134,7 @@ impl<'a> Server<'a> {
             .callback(move |query| {
                 if let Err(error) = codec::check_size::<Open>(size(&query)) {
                     let refused = Opening::Refused { reason: error.to_string() };
-                    let bytes = encode(&refused).expect("a reason within its limit can be written");
+                    let bytes = encode(&refused).expect("a reason within its limit can be encoded");
                     answers.send(query, of.clone(), bytes);
                 } else if let Some(Work::Describe(query) | Work::Open(query)) =
                     inbox.put_query(work(query))
@@ -200,7 +201,7 @@ impl<'a> Server<'a> {
         }
     }
 
-    /// A new session; everything that hears its requests stands when this returns.
+    /// Opens a session. Its subscribers are declared before this returns.
     fn lease(&mut self, query: &Query) -> Result<String> {
         let bytes = query.payload().map(|payload| payload.to_bytes()).unwrap_or_default();
         let opened: Open = decode(&bytes)?;
@@ -249,7 +250,7 @@ impl<'a> Server<'a> {
         Ok(name)
     }
 
-    /// Notes when the token of the session's holder comes and goes.
+    /// Watches the liveliness token of the session's holder.
     fn watch(&self, name: &str, seen: Arc<Mutex<Holder>>) -> Result<Subscriber<()>> {
         self.network
             .liveliness()
@@ -328,13 +329,13 @@ impl<'a> Server<'a> {
         }
     }
 
-    /// Sessions in use.
+    /// Number of sessions in use.
     fn sessions(&self) -> u32 {
         self.leases.values().filter(|lease| !lease.session.closed).count() as u32
     }
 }
 
-/// Nothing that holds it can leave it half written.
+/// A panic cannot leave the value inconsistent.
 fn locked(holder: &Mutex<Holder>) -> MutexGuard<'_, Holder> {
     holder.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -347,11 +348,11 @@ fn in_words(error: zenoh::Error) -> anyhow::Error {
     anyhow!("zenoh: {}", protocol::transport::in_words(error))
 }
 
-/// Memory that this process holds; 0 where the system does not tell.
+/// Resident memory of this process; 0 if the system does not report it.
 fn resident_bytes() -> u64 {
     let Ok(text) = std::fs::read_to_string("/proc/self/statm") else { return 0 };
     let pages: u64 =
         text.split_whitespace().nth(1).and_then(|word| word.parse().ok()).unwrap_or_default();
-    // SAFETY: a plain question to the system.
+    // SAFETY: sysconf only returns a value.
     pages * unsafe { libc::sysconf(libc::_SC_PAGESIZE) } as u64
 }

@@ -1,4 +1,4 @@
-//! The serve subcommand: its arguments, the network it opens, and how it ends.
+//! The serve subcommand: arguments, network and shutdown.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -19,10 +19,10 @@ use crate::tasks::{self, Task};
 use crate::worlds::Worlds;
 
 const PARENT_POLL: Duration = Duration::from_millis(500);
-/// A wedged simulation is given up after that.
+/// Time after which a stuck simulation is abandoned.
 const FINISH_WAIT_MAX: Duration = Duration::from_secs(10);
 const CLOSE_WAIT_MAX: Duration = Duration::from_secs(3);
-/// A client waits this long for the router or agent that it is told to connect to.
+/// How long a client waits for its router or agent.
 const CLIENT_WAIT_MS: u32 = 30_000;
 
 /// Serve the Bridge tasks over zenoh until a signal arrives
@@ -31,19 +31,19 @@ const CLIENT_WAIT_MS: u32 = 30_000;
 pub struct Arguments {
     #[command(flatten)]
     ways: Ways,
-    /// Serve only these: TASK, TASK/VARIANT or TASK/all; every task in every variant by default.
+    /// Tasks to serve: TASK, TASK/VARIANT or TASK/all; by default all tasks in all variants.
     #[arg(long, num_args = 1.., value_name = "TASK")]
     tasks: Vec<String>,
     /// Namespace: peers see each other only within the same fleet.
     #[arg(long, value_name = "NAME", default_value = "local", value_parser = fleet)]
     fleet: String,
-    /// Largest number of sessions open at the same time.
+    /// Maximum number of concurrent sessions.
     #[arg(
         long, value_name = "COUNT", default_value_t = 16,
         value_parser = clap::value_parser!(u32).range(1..=limits::SESSIONS_MAX.into())
     )]
     sessions: u32,
-    /// Exit when the process with this id is no longer the parent of this one.
+    /// Exit when the process with this id is no longer the parent process.
     #[arg(long, value_name = "PID")]
     exit_with_parent: Option<u32>,
     /// Write the server's id into this file when it is ready.
@@ -51,7 +51,7 @@ pub struct Arguments {
     id_file: Option<PathBuf>,
 }
 
-/// At least one of them is needed.
+/// At least one of these is required.
 #[derive(Debug, Args)]
 #[group(required = true, multiple = true)]
 struct Ways {
@@ -66,7 +66,8 @@ struct Ways {
     multicast: bool,
 }
 
-/// Serves until a signal comes or the parent is gone; prints a line that begins with `ready {server id}` when it can.
+/// Serves until a signal arrives or the parent process ends. Prints a line that starts with `ready
+/// {server id}` when ready.
 pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
     let tasks = match arguments.tasks.as_slice() {
         [] => tasks,
@@ -101,14 +102,14 @@ pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
         let worlds = Worlds::new(tasks, options.sessions_max as usize);
         let server = Server::new(&served_on, worlds, options);
         let result = server.and_then(|server| server.run(&stopping, ready));
-        // Nobody listens once the process has given this thread up.
+        // The receiver is gone if the process has abandoned this thread.
         let _ = done.send(result);
     };
     let thread = thread::Builder::new().name("simulation".to_owned()).spawn(simulate)?;
     let result = wait(&stop, arguments.exit_with_parent, &ended);
     ensure!(
         result.is_some() || thread.is_finished(),
-        "the simulation did not end within {} s",
+        "the simulation thread did not end within {} s",
         FINISH_WAIT_MAX.as_secs()
     );
     thread.join().map_err(|_| anyhow!("the simulation thread panicked"))?;
@@ -116,11 +117,12 @@ pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
     result.unwrap_or(Ok(()))
 }
 
-/// Leaves the rest to the end of the process where zenoh waits for a peer that reads nothing.
+/// Closes the network. If zenoh waits too long for a peer that does not read, the end of the
+/// process closes it.
 fn close(network: zenoh::Session) -> Result<()> {
     let (done, closed) = mpsc::channel();
     thread::Builder::new().name("closing".to_owned()).spawn(move || {
-        // Nobody listens any more once that took too long.
+        // The receiver is gone if this took too long.
         let _ = done.send(network.close().wait());
     })?;
     match closed.recv_timeout(CLOSE_WAIT_MAX) {
@@ -130,12 +132,12 @@ fn close(network: zenoh::Session) -> Result<()> {
     }
 }
 
-/// A name that may stand in keys.
+/// Checks that a fleet's name is valid in keys.
 fn fleet(name: &str) -> Result<String, KeyError> {
     Keys::new(name).map(|_| name.to_owned())
 }
 
-/// Where the server is found, and what it serves.
+/// The endpoints and the tasks of the server.
 fn offer(arguments: &Arguments, tasks: &[Task]) -> String {
     let Arguments { ways: Ways { connect, listen, multicast }, fleet, .. } = arguments;
     let mut ways = Vec::new();
@@ -158,7 +160,7 @@ fn offer(arguments: &Arguments, tasks: &[Task]) -> String {
     format!("{} (fleet {fleet}): {}", ways.join(", "), tasks.join(", "))
 }
 
-/// SIGINT and SIGTERM.
+/// Sets `stop` on SIGINT and SIGTERM.
 fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<()> {
     let runtime = Builder::new_current_thread().enable_io().build()?;
     let mut signals = runtime.block_on(async {
@@ -180,7 +182,7 @@ fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<()> {
     Ok(())
 }
 
-/// The simulation's result; none when it does not end though it was told to.
+/// The simulation's result; `None` if it does not end after `stop` is set.
 fn wait(
     stop: &AtomicBool,
     parent: Option<u32>,
@@ -195,7 +197,7 @@ fn wait(
         if let Some(parent) = parent
             && std::os::unix::process::parent_id() != parent
         {
-            tracing::info!("the parent process {parent} is gone");
+            tracing::info!("the parent process {parent} has ended");
             stop.store(true, Ordering::Relaxed);
         }
     }
@@ -215,7 +217,7 @@ fn configuration(ways: &Ways) -> Result<zenoh::Config> {
     for (key, value) in settings {
         configuration.insert_json5(key, &value).map_err(|error| {
             let cause = transport::in_words(error);
-            anyhow!("zenoh does not take {key} = {value}: {cause}")
+            anyhow!("zenoh rejects the setting {key} = {value}: {cause}")
         })?;
     }
     Ok(configuration)

@@ -1,4 +1,4 @@
-//! One leased session: its numbered requests, its world, its saved states.
+//! A leased session: its numbered requests, its environment, its saved states.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -10,16 +10,16 @@ use crate::fault::Fault;
 use crate::world::{Snapshot, World};
 use crate::worlds::{Key, Worlds};
 
-/// Answers requests exactly once each. Use it in the thread that renders.
+/// Replies to every request exactly once. Use it in the thread that renders.
 pub struct Session {
-    /// Steps done.
+    /// Number of executed steps.
     pub steps: u64,
-    /// Whether it was closed; it answers that same `Close` still.
+    /// Whether it was closed; it still answers a repeated `Close`.
     pub closed: bool,
     opened: Open,
     last_sequence: u64,
     last_reply: Bytes,
-    /// Of the last observation, as its holder has it.
+    /// The last observed image, as its holder has it.
     last_image: Option<Image>,
     is_running: bool,
     slots: BTreeMap<u32, Snapshot>,
@@ -27,7 +27,7 @@ pub struct Session {
 }
 
 impl Session {
-    /// A session of an offered task, with a world of its own.
+    /// A session for an offered task, with its own environment.
     pub fn new(opened: Open, worlds: &mut Worlds) -> Result<Session, Fault> {
         let key = key(&opened, &opened.task, &opened.variant);
         let world = worlds.take(&key)?;
@@ -44,7 +44,7 @@ impl Session {
         })
     }
 
-    /// The reply's bytes; none when the request is older than the last one.
+    /// The reply's bytes; `None` if the request is older than the last one.
     pub fn answer(&mut self, bytes: &[u8], worlds: &mut Worlds) -> Option<Bytes> {
         let (request, refusal) = match protocol::codec::parse::<Request>(bytes) {
             Ok((request, invalid)) => (request, invalid),
@@ -76,7 +76,7 @@ impl Session {
         Some(reply)
     }
 
-    /// Gives the world back.
+    /// Returns the environment to the pool.
     pub fn end(&mut self, worlds: &mut Worlds) {
         self.closed = true;
         self.is_running = false;
@@ -158,7 +158,8 @@ impl Session {
         }
     }
 
-    /// Resets this world, or another one and takes it instead; a refusal leaves this one alone.
+    /// Resets the current environment, or replaces it by one for another task. A refused reset
+    /// leaves it unchanged.
     fn reset(
         &mut self,
         key: Key,
@@ -176,11 +177,11 @@ impl Session {
             return observation;
         }
         self.release(worlds);
-        self.world = Some((key, world)); // after a fault to be dropped with it
+        self.world = Some((key, world)); // after a fault it is dropped by `faulted`
         observation
     }
 
-    /// The world may be broken for good: the next Reset gets another one.
+    /// The environment may be broken permanently: the next Reset uses another one.
     fn faulted(&mut self, sequence: u64, kind: FaultKind, reason: &str) -> Bytes {
         self.is_running = false;
         self.slots.clear();
@@ -194,7 +195,7 @@ impl Session {
         }
     }
 
-    /// An observation with the expert's action, for those who asked for it.
+    /// The observation, with the expert's action in a session opened with `expert`.
     fn seen(&self, observation: Observation) -> Result<Observation, Fault> {
         let expert_action = match &self.world {
             Some((_, world)) if self.opened.expert => Some(world.expert_action()?.to_vec()),
@@ -204,13 +205,13 @@ impl Session {
     }
 }
 
-/// The bytes of a refusal.
+/// The encoding of a refusal.
 pub fn refused(sequence: u64, reason: &str) -> Bytes {
     written(&Reply::Refused { sequence, reason: short(reason) })
 }
 
 fn written(reply: &Reply) -> Bytes {
-    encode(reply).expect("a reason within its limit can be written").into()
+    encode(reply).expect("a reason within its limit can be encoded").into()
 }
 
 fn words(error: Option<CodecError>) -> String {
@@ -236,7 +237,7 @@ fn name(request: &Request) -> &'static str {
     }
 }
 
-/// Within the limit on texts, whatever was said.
+/// Cuts a reason to the protocol's limit on texts.
 fn short(reason: &str) -> String {
     reason[..reason.floor_char_boundary(limits::TEXT_BYTES_MAX)].to_owned()
 }

@@ -1,4 +1,4 @@
-//! Success and the other episode statistics, after SIMPLER's evaluate().
+//! Success and the other episode statistics, following SIMPLER's evaluate().
 
 use std::sync::Arc;
 
@@ -9,14 +9,14 @@ use protocol::Statistics;
 use crate::model::{Names, Vector};
 use crate::tasks::Task;
 
-/// What the statistics remember of the episode so far.
+/// The state of the statistics in an episode.
 #[derive(Debug, Clone)]
 pub struct Memory {
-    /// Settled x and y of the source's origin, metres.
+    /// The source's origin after settling: x and y in metres.
     source_origin: [f64; 2],
     target_origin: [f64; 2],
     distractor_origins: Vec<[f64; 2]>,
-    /// Settled half extents, rotated as SIMPLER does, metres.
+    /// Half extents after settling in metres, rotated as in SIMPLER.
     source_half: Vector,
     target_half: Vector,
     grasped_steps: u32,
@@ -25,7 +25,7 @@ pub struct Memory {
     ever_success: bool,
 }
 
-/// Contacts of the source now: force of each finger on it (N), and what else it touches.
+/// The source's current contacts: the force of each finger in N, and what else it touches.
 pub struct Touch {
     fingers: [Vector; 2],
     robot: bool,
@@ -33,7 +33,7 @@ pub struct Touch {
     elsewhere: bool,
 }
 
-/// Judges an episode by contacts and poses.
+/// Computes the statistics of an episode from contacts and poses.
 pub struct Judge {
     task: Arc<Task>,
     names: Names,
@@ -53,7 +53,7 @@ impl Judge {
         }
     }
 
-    /// The memory of an episode whose objects have just settled.
+    /// The state at the start of an episode, after the objects have settled.
     pub fn begin(&self, data: &MjData<Arc<MjModel>>) -> Memory {
         let Names { source, target, .. } = self.names;
         let origin = |body: usize| [data.xpos()[body][0], data.xpos()[body][1]];
@@ -70,7 +70,7 @@ impl Judge {
         }
     }
 
-    /// Statistics of this step; advances the memory.
+    /// The statistics of this step; updates the state.
     pub fn judge(&self, data: &MjData<Arc<MjModel>>, memory: &mut Memory) -> Statistics {
         let rule = &self.task.grasp;
         let Names { source, target, .. } = self.names;
@@ -79,8 +79,8 @@ impl Judge {
         memory.grasped_steps = if is_grasped { memory.grasped_steps + 1 } else { 0 };
         memory.ever_grasped |= is_grasped;
         memory.consecutive_grasp |= memory.grasped_steps >= rule.consecutive_steps;
-        // SIMPLER compares the settled origin with the current centre of mass here; the
-        // offset between the two leaks into the source's displacement and is kept.
+        // SIMPLER compares the settled origin with the current centre of mass here. The offset
+        // between the two is part of the source's displacement; this is kept.
         let source_moved = moved(&data.xipos()[source], &memory.source_origin);
         let distractors = self.names.distractors.iter().zip(&memory.distractor_origins);
         let other_moved = std::iter::once((&target, &memory.target_origin))
@@ -102,7 +102,7 @@ impl Judge {
         }
     }
 
-    /// Contacts of the source whose impulse per physics step is large enough to count.
+    /// The source's contacts with a large enough impulse per physics step.
     pub fn touch(&self, data: &MjData<Arc<MjModel>>) -> Touch {
         let mut touch =
             Touch { fingers: [[0.0; 3]; 2], robot: false, target: false, elsewhere: false };
@@ -122,7 +122,8 @@ impl Judge {
             if let Some(finger) = self.names.fingers.iter().position(|&body| body == other) {
                 let mut force = [0.0; 3];
                 mju_mul_mat_t_vec(&mut force, &contact.frame, &local);
-                // The contact force acts on the second geom's body; flip it when that is the finger.
+                // The contact force acts on the second geom's body; it is negated if the source is
+                // the first.
                 let sign = if bodies[1] == source { 1.0 } else { -1.0 };
                 for (sum, force) in touch.fingers[finger].iter_mut().zip(force) {
                     *sum += sign * force;
@@ -147,7 +148,7 @@ impl Judge {
         presses(0, -1.0) && presses(1, 1.0)
     }
 
-    /// SIMPLER's success: the source stands over the target, near enough and low enough.
+    /// SIMPLER's success: the source is above the target, near and low enough.
     pub fn is_on_target(
         &self,
         data: &MjData<Arc<MjModel>>,
@@ -169,7 +170,7 @@ impl Judge {
     }
 }
 
-/// SIMPLER rotates the full extents as a vector (signs and all) and halves them; kept as is.
+/// SIMPLER rotates the full extents as a vector, including signs, and halves them; this is kept.
 fn half_extents(quaternion: &[f64; 4], extents: &Vector) -> Vector {
     let mut rotated = [0.0; 3];
     mju_rot_vec_quat(&mut rotated, extents, quaternion);
@@ -190,7 +191,7 @@ fn moved(position: &Vector, origin: &[f64; 2]) -> f64 {
     norm(&[position[0] - origin[0], position[1] - origin[1]])
 }
 
-/// Euclidean norm summed in order, so that it is the same in every language.
+/// Euclidean norm, summed in order so that it is the same in every language.
 pub fn norm(vector: &[f64]) -> f64 {
     vector.iter().fold(0.0, |sum, value| sum + value * value).sqrt()
 }

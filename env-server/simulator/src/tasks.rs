@@ -1,4 +1,4 @@
-//! The tasks and their variants: reads assets/tasks.toml, the one description for every simulator.
+//! The tasks and their variants, read from assets/tasks.toml, which all simulators share.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -10,26 +10,28 @@ use toml::{Table, Value};
 
 use crate::assets::Assets;
 
-/// Numbers of an action: translation in metres, rotation vector in radians, gripper +1 open or -1 closed.
+/// Dimensions of an action: translation in metres, rotation vector in radians, gripper +1 open or
+/// -1 closed.
 pub const ACTION_LENGTH: usize = 7;
-/// Numbers of a state, in Bridge's order: x y z roll pitch yaw pad gripper.
+/// Dimensions of a state in Bridge's order: x y z roll pitch yaw pad gripper.
 pub const STATE_LENGTH: usize = 8;
 
 const FILE: &str = "tasks.toml";
 
-/// The variant of a task as its own table describes it.
+/// The variant of a task that is defined by the task's own table.
 pub const DEFAULT: &str = "default";
-/// In place of a variant's or a task's name: every one of them.
+/// Stands for all variants or all tasks.
 const ALL: &str = "all";
 
-/// A task in one of its variants. Its text is TASK, or TASK/VARIANT for another than the default one.
+/// A task in one of its variants. Its text is TASK, or TASK/VARIANT for a variant other than the
+/// default.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TaskId {
     pub task: String,
     pub variant: String,
 }
 
-/// Where the objects start: metres in the world frame, yaw in degrees.
+/// The initial positions of the objects: metres in the world frame, yaw in degrees.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(from = "[f64; 5]")]
 pub struct Layout {
@@ -41,7 +43,7 @@ pub struct Layout {
     pub distractors: Vec<Pose>,
 }
 
-/// Where a distractor starts: metres in the world frame, yaw in degrees.
+/// The initial position of a distractor: metres in the world frame, yaw in degrees.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(from = "[f64; 3]")]
 pub struct Pose {
@@ -50,9 +52,10 @@ pub struct Pose {
     pub yaw: f64,
 }
 
-/// An object that the task does not ask for: a body of the scene with a free joint of its name.
+/// An object that is not part of the task: a body of the scene with a free joint of the same name.
 ///
-/// `x`, `y` and `yaw` bound random layouts, in which it keeps `separation_min` from every other object.
+/// `x`, `y` and `yaw` are the ranges of random layouts, in which it keeps `separation_min` from
+/// every other object.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Distractor {
@@ -62,14 +65,14 @@ pub struct Distractor {
     pub y: [f64; 2],
     pub yaw: [f64; 2],
     pub separation_min: f64,
-    /// One for each layout of the grid.
+    /// One pose for each layout of the grid.
     pub layouts: Vec<Pose>,
 }
 
-/// What a task changes in its scene before it is compiled: element, its name, attribute, value.
+/// A task's changes to its scene before it is compiled: element, its name, attribute, value.
 pub type MjcfChanges = BTreeMap<String, BTreeMap<String, BTreeMap<String, String>>>;
 
-/// The box random layouts are drawn from, and what is kept out of it.
+/// The ranges of random layouts and the exclusions around grid layouts.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RandomRanges {
@@ -104,7 +107,7 @@ pub struct WorldSettings {
     pub robot_body: String,
 }
 
-/// Settings of the damped least squares solver.
+/// Settings of the damped least-squares solver.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InverseKinematics {
@@ -114,7 +117,7 @@ pub struct InverseKinematics {
     pub failure: f64,
 }
 
-/// SIMPLER's thresholds for grasped and moved.
+/// SIMPLER's thresholds for grasping and moving.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GraspRule {
@@ -125,7 +128,7 @@ pub struct GraspRule {
     pub target_margin: f64,
 }
 
-/// One task in one variant, complete: nothing else decides what an episode is.
+/// One task in one variant; it completely defines an episode.
 #[derive(Debug, Clone)]
 pub struct Task {
     pub id: TaskId,
@@ -138,12 +141,12 @@ pub struct Task {
     pub grasp: GraspRule,
 }
 
-/// What stands under a task's name, with a variant's fields in place of its own.
+/// The table of a task, with a variant's values merged in.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskRule {
     pub version: u32,
-    /// Python's name for it; nobody asks for it here.
+    /// The task's Gymnasium id, which only Python uses.
     #[serde(rename = "gymnasium_id")]
     pub _gymnasium_id: String,
     pub instruction: String,
@@ -154,7 +157,7 @@ pub struct TaskRule {
     pub robot_joints: [f64; 8],
     pub source: String,
     pub target: String,
-    /// For reasoning about demonstrations, which only Python records.
+    /// Phrases in the reasoning of demonstrations, which only Python records.
     #[serde(rename = "source_phrase")]
     pub _source_phrase: String,
     #[serde(rename = "target_phrase")]
@@ -164,7 +167,7 @@ pub struct TaskRule {
     pub height_offset_max: f64,
     pub completely_on_target: bool,
     pub source_height: f64,
-    /// None where the target does not move.
+    /// `None` if the target does not move.
     pub target_height: Option<f64>,
     pub grasp_offset: [f64; 3],
     pub grasp_symmetry: f64,
@@ -230,7 +233,7 @@ impl From<[f64; 3]> for Pose {
 }
 
 impl TaskId {
-    /// TASK or TASK/VARIANT.
+    /// Parses TASK or TASK/VARIANT.
     pub fn parse(text: &str) -> TaskId {
         let (task, variant) = text.rsplit_once('/').unwrap_or((text, DEFAULT));
         TaskId { task: task.to_owned(), variant: variant.to_owned() }
@@ -247,7 +250,8 @@ impl fmt::Display for TaskId {
     }
 }
 
-/// All tasks of tasks.toml in all variants, in the file's order; unknown or missing keys are errors.
+/// All tasks of tasks.toml in all variants, in the file's order. Unknown or missing keys are
+/// errors.
 pub fn load(assets: &Assets) -> Result<Vec<Task>> {
     read(&assets.text(FILE)?, assets).with_context(|| format!("cannot read {FILE}"))
 }
@@ -284,7 +288,7 @@ fn read(text: &str, assets: &Assets) -> Result<Vec<Task>> {
         };
         ensure!(
             !variants.contains_key(DEFAULT),
-            "{place}.variants.{DEFAULT}: expected it in the task's own table"
+            "{place}.variants.{DEFAULT}: expected the default variant in the task's own table"
         );
         let default = (DEFAULT.to_owned(), Value::Table(Table::new()));
         for (variant, changes) in std::iter::once(default).chain(variants) {
@@ -311,7 +315,7 @@ fn read(text: &str, assets: &Assets) -> Result<Vec<Task>> {
     Ok(read)
 }
 
-/// Puts a variant's values in place of its task's, key by key in tables.
+/// Merges a variant's values into its task's, key by key in tables.
 fn merge(place: &str, own: &mut Value, changes: Value) -> Result<()> {
     match (own, changes) {
         (Value::Table(own), Value::Table(changes)) => {

@@ -1,4 +1,4 @@
-//! The trace subcommand: every number of episodes, to compare two simulators.
+//! The trace subcommand: prints all numbers of episodes, to compare two simulators.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -12,27 +12,28 @@ use sha2::{Digest, Sha256};
 use crate::tasks::{self, ACTION_LENGTH, Task};
 use crate::world::World;
 
-/// Print every number of episodes: one JSON object for each reset and each step
+/// Print all numbers of episodes: one JSON object for each reset and each step
 #[derive(Debug, Args)]
 #[group(skip)]
 pub struct Arguments {
-    /// TASK, TASK/VARIANT, TASK/all, or all.
+    /// Tasks to run: TASK, TASK/VARIANT, TASK/all, or all.
     #[arg(long, num_args = 1.., required = true, value_name = "TASK")]
     tasks: Vec<String>,
-    /// Drawn from the seeds if left out.
+    /// Fixed initial layouts; by default, random layouts from the seeds.
     #[arg(long, num_args = 1..)]
     layouts: Vec<u32>,
+    /// Seeds of the episodes.
     #[arg(long, num_args = 1.., default_values_t = [0])]
     seeds: Vec<u64>,
     /// Height and width of the image.
     #[arg(long, default_value_t = 128)]
     side: u32,
-    /// 7 numbers per line; without it the scripted expert acts.
+    /// File with the actions, 7 numbers per line; by default the scripted expert acts.
     #[arg(long, value_name = "FILE")]
     actions: Option<PathBuf>,
 }
 
-/// Floats stand as their bits, 16 (or 8) hexadecimal digits.
+/// Floats are represented by their bits as 16 (or 8) hexadecimal digits.
 #[derive(Serialize)]
 struct Line<'a> {
     episode: &'a str,
@@ -47,7 +48,7 @@ struct Line<'a> {
 
 type Action = [f32; ACTION_LENGTH];
 
-/// Runs each episode to its horizon or the actions' end.
+/// Runs each episode to its horizon or to the end of the actions.
 pub fn trace(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
     let Arguments { layouts, seeds, side, .. } = arguments;
     let actions = arguments.actions.map(read).transpose()?;
@@ -95,7 +96,7 @@ fn read(file: PathBuf) -> Result<Vec<Action>> {
     let action = |line: &str| -> Result<Action> {
         let numbers = line.split_whitespace().map(str::parse).collect::<Result<Vec<f64>, _>>()?;
         let numbers: [f64; ACTION_LENGTH] = numbers.try_into().map_err(|numbers: Vec<f64>| {
-            anyhow!("expected {ACTION_LENGTH} numbers, got {}: {line:?}", numbers.len())
+            anyhow!("expected {ACTION_LENGTH} numbers per line, got {}: {line:?}", numbers.len())
         })?;
         Ok(numbers.map(|number| number as f32))
     };

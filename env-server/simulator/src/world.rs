@@ -16,17 +16,17 @@ use crate::model::{self, Names, Vector};
 use crate::success::{Judge, Memory};
 use crate::tasks::{ACTION_LENGTH, Layout, STATE_LENGTH, Task};
 
-/// Objects start this far above rest, metres.
+/// Objects start this far above their rest height, in metres.
 const START_GAP: f64 = 0.002;
-/// m/s or rad/s: beyond this the physics has diverged. An object that falls off the table and lands
-/// on an edge spins at more than 100 rad/s.
+/// Maximum speed in m/s or rad/s; beyond it the physics has diverged. An object that falls off the
+/// table and lands on an edge spins at more than 100 rad/s.
 const SPEED_MAX: f64 = 1000.0;
-/// MuJoCo's values for a kinematic tree that has just moved, and for one that may sleep.
+/// MuJoCo's values for a kinematic tree that has just moved and for one that may sleep.
 const AWAKE: i32 = -1 - mjMINAWAKE as i32;
 const READY_TO_SLEEP: i32 = -1;
-/// Bridge reads the gripper's attitude relative to pointing down: R_tcp times this, transposed.
+/// Bridge's gripper attitude is relative to pointing down: R_tcp times the transpose of this.
 const DOWN: [f64; 9] = [0.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0];
-/// All that goes into the next physics step, the warm start included.
+/// The complete input of the next physics step, including the warm start.
 const STATE: u32 = MjtState::mjSTATE_INTEGRATION as u32;
 const WARNINGS: [(MjtWarning, &str); 3] = [
     (MjtWarning::mjWARN_BADQPOS, "mjWARN_BADQPOS"),
@@ -34,7 +34,7 @@ const WARNINGS: [(MjtWarning, &str); 3] = [
     (MjtWarning::mjWARN_BADQACC, "mjWARN_BADQACC"),
 ];
 
-/// One task in MuJoCo with its camera. Use it in the thread that made it.
+/// One task in MuJoCo with its camera. Use it only in the thread that created it.
 pub struct World {
     task: Arc<Task>,
     names: Names,
@@ -51,7 +51,7 @@ struct Episode {
     steps: u32,
 }
 
-/// The whole state of an episode, bit-exact.
+/// The complete state of an episode, bit-exact.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
     state: Box<[f64]>,
@@ -75,7 +75,7 @@ impl World {
         })
     }
 
-    /// Places and settles the objects; the same arguments give the same bytes.
+    /// Places the objects and lets them settle. The same arguments give the same bytes.
     pub fn reset(&mut self, layout: Option<u32>, seed: u64) -> Result<Observation, Fault> {
         let layout = place(&self.task, layout, seed)?;
         self.data.reset();
@@ -90,7 +90,8 @@ impl World {
         self.observe()
     }
 
-    /// One control step of 0.2 s. Success ends no episode: SIMPLER reads the last step.
+    /// Executes one control step of 0.2 s. Success does not end an episode, because SIMPLER
+    /// evaluates the last step.
     pub fn step(&mut self, action: &[f32]) -> Result<Transition, Fault> {
         let steps = self.running()?.steps;
         let steps_max = self.task.rule.steps_max;
@@ -126,7 +127,7 @@ impl World {
         })
     }
 
-    /// Returns to a saved state of the same task.
+    /// Restores a saved state of the same task.
     pub fn restore(&mut self, snapshot: &Snapshot) -> Result<Observation, Fault> {
         self.data.reset();
         // SAFETY: `eq_active` is not read before the next forward pass.
@@ -138,18 +139,18 @@ impl World {
         self.observe()
     }
 
-    /// The scripted expert's noise-free action here; changes nothing.
+    /// The scripted expert's noise-free action in this state; changes nothing.
     pub fn expert_action(&self) -> Result<[f32; ACTION_LENGTH], Fault> {
         let sight = self.sight(&self.running()?.memory);
         Ok(expert::decide(&self.task.rule, &sight).map(|number| number as f32))
     }
 
-    /// Steps of this episode.
+    /// Number of steps in this episode.
     pub fn steps(&self) -> Result<u32, Fault> {
         Ok(self.running()?.steps)
     }
 
-    /// Joint positions and velocities, for those who compare simulators.
+    /// Joint positions and velocities, to compare simulators.
     pub fn joints(&self) -> (&[f64], &[f64]) {
         (self.data.qpos(), self.data.qvel())
     }
@@ -183,10 +184,10 @@ impl World {
         })
     }
 
-    /// Counts the step.
+    /// Counts the step and computes its statistics.
     fn judged(&mut self) -> Result<Statistics, Fault> {
         let Some(episode) = &mut self.episode else {
-            return Err(Fault::Internal("a step without an episode".to_owned()));
+            return Err(Fault::Internal("step without an episode".to_owned()));
         };
         episode.steps += 1;
         Ok(self.judge.judge(&self.data, &mut episode.memory))
@@ -213,7 +214,7 @@ impl World {
         }
     }
 
-    /// Lets the objects come to rest, as SIMPLER does; its drop before that is left out.
+    /// Lets the objects come to rest, as in SIMPLER, but without its initial drop.
     fn settle(&mut self) -> Result<(), Fault> {
         let task = Arc::clone(&self.task);
         let settings = &task.settings;
@@ -266,11 +267,12 @@ impl World {
         (0..physics_steps).for_each(|_| self.data.step());
     }
 
-    /// Poses and contacts of this moment: a physics step leaves them one step old.
+    /// Updates poses and contacts: after a physics step they are one step old.
     ///
-    /// Sleeping objects are woken, because MuJoCo leaves their contacts out and the judge needs them; they sleep again
-    /// after the next physics step. Which ones follows from the velocities alone, and the warm start is kept, so that
-    /// continuing from here equals continuing after a restore.
+    /// Sleeping objects are woken, because MuJoCo omits their contacts and the success check needs
+    /// them; they sleep again after the next physics step. Which objects sleep depends only on the
+    /// velocities, and the warm start is kept, so that continuing from here equals continuing after
+    /// a restore.
     fn forward(&mut self) {
         let warm_start = self.data.qacc_warmstart().to_vec();
         let model = self.data.model();
@@ -284,18 +286,18 @@ impl World {
         let resting = trees.filter(|(_, tree)| marks[**tree as usize] == READY_TO_SLEEP);
         let resting: Vec<usize> = resting.map(|(dof, _)| dof).collect();
         for &dof in &resting {
-            self.data.qvel_mut()[dof] = -0.0; // wakes them in MuJoCo and changes nothing else
+            self.data.qvel_mut()[dof] = -0.0; // wakes them in MuJoCo without any other effect
         }
         self.data.forward();
         for &dof in &resting {
             self.data.qvel_mut()[dof] = 0.0;
         }
-        // SAFETY: no mark is an index; MuJoCo counts such marks upwards to -1.
+        // SAFETY: no mark is an index; MuJoCo counts such marks up to -1.
         unsafe { self.data.tree_asleep_mut() }.copy_from_slice(&marks);
         self.data.qacc_warmstart_mut().copy_from_slice(&warm_start);
     }
 
-    /// Updates poses and contacts, and checks that the physics has not diverged.
+    /// Updates poses and contacts and checks that the physics has not diverged.
     fn refresh(&mut self, steps: u32) -> Result<(), Fault> {
         self.forward();
         let warned = WARNINGS
@@ -303,7 +305,7 @@ impl World {
             .filter(|(warning, _)| self.data.warning()[*warning as usize].number > 0);
         let diverged: Vec<String> = warned.map(|(_, name)| format!("'{name}'")).collect();
         let speeds = self.data.qvel().iter().map(|speed| speed.abs());
-        // The first that is no number, or the first of the fastest.
+        // The first NaN, or the first of the fastest.
         let (fastest, speed) = speeds.enumerate().fold((0, f64::NEG_INFINITY), |best, next| {
             if best.1.is_nan() || next.1 <= best.1 { best } else { next }
         });
@@ -350,7 +352,7 @@ impl World {
         [x, y, z, roll, pitch, yaw, 0.0, self.gripper_opening()].map(|number| number as f32)
     }
 
-    /// Mean finger opening, 0 (closed) to 1 (open) of the joints' range.
+    /// Mean finger opening, from 0 (closed) to 1 (open) of the joints' range.
     fn gripper_opening(&self) -> f64 {
         let [low, high] = self.data.model().jnt_range()[self.names.finger_joints[0]];
         let fingers = self.fingers();
@@ -364,11 +366,11 @@ impl World {
     }
 }
 
-/// The warning counters are read after each step; MuJoCo's own handler would also append to a log
-/// file in whatever folder the process runs in.
+/// The warning counters are read after each step. MuJoCo's own handler would also write a log file
+/// into the current working folder.
 fn silence_warnings() {
     static SILENCED: Once = Once::new();
     unsafe extern "C" fn ignore(_warning: *const std::ffi::c_char) {}
-    // SAFETY: set once, before this process steps any world.
+    // SAFETY: set once, before any environment of this process is stepped.
     SILENCED.call_once(|| unsafe { mju_user_warning = Some(ignore) });
 }

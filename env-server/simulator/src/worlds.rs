@@ -1,4 +1,4 @@
-//! The worlds of one process: made when first needed, handed from session to session, limited.
+//! The environments of one process: created on demand, reused by sessions, limited in number.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use crate::fault::Fault;
 use crate::tasks::{Task, TaskId};
 use crate::world::World;
 
-/// Which worlds are alike.
+/// Environments with equal keys are interchangeable.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Key {
     pub task: String,
@@ -16,10 +16,10 @@ pub struct Key {
     pub image_width: u32,
 }
 
-/// Use it in the thread that renders.
+/// A pool of environments. Use it in the thread that renders.
 ///
-/// A world carries nothing from one episode to the next, so it does not matter which one a session
-/// gets. Making one takes tens of milliseconds.
+/// An environment keeps no state between episodes, so a session may get any one. Creating one takes
+/// tens of milliseconds.
 pub struct Worlds {
     tasks: Vec<Arc<Task>>,
     idle_max: usize,
@@ -27,18 +27,18 @@ pub struct Worlds {
 }
 
 impl Worlds {
-    /// `idle_max`: worlds kept that no session uses.
+    /// `idle_max` is the maximum number of idle environments.
     pub fn new(tasks: Vec<Task>, idle_max: usize) -> Worlds {
         let tasks = tasks.into_iter().map(Arc::new).collect();
         Worlds { tasks, idle_max, idle: VecDeque::new() }
     }
 
-    /// All that is offered.
+    /// All offered tasks.
     pub fn tasks(&self) -> &[Arc<Task>] {
         &self.tasks
     }
 
-    /// The task; refused when it is not offered.
+    /// The task; an error if it is not offered.
     pub fn task(&self, name: &str, variant: &str) -> Result<&Arc<Task>, Fault> {
         let wanted = TaskId { task: name.to_owned(), variant: variant.to_owned() };
         self.tasks.iter().find(|task| task.id == wanted).ok_or_else(|| {
@@ -47,7 +47,7 @@ impl Worlds {
         })
     }
 
-    /// A world for the caller alone.
+    /// An environment for exclusive use.
     pub fn take(&mut self, key: &Key) -> Result<World, Fault> {
         if let Some(index) = self.idle.iter().position(|(idle, _)| idle == key)
             && let Some((_, world)) = self.idle.remove(index)
@@ -57,7 +57,8 @@ impl Worlds {
         World::new(self.task(&key.task, &key.variant)?, key.image_height, key.image_width)
     }
 
-    /// Keeps a sound world for the next taker; drops the one unused for longest if need be.
+    /// Returns an intact environment to the pool; removes the one idle for longest if there are too
+    /// many.
     pub fn give_back(&mut self, key: Key, world: World) {
         self.idle.push_back((key, world));
         if self.idle.len() > self.idle_max {

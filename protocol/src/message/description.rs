@@ -1,4 +1,4 @@
-//! What a server says about itself.
+//! What a server offers: its tasks, and the meaning of their states and actions.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,19 +9,19 @@ use crate::limits::{
     STATE_DIMENSIONS_MAX,
 };
 
-/// One number of a state or of an action.
+/// One dimension of a state or of an action.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Dimension {
-    /// What it is, such as `x` or `gripper`.
+    /// Its name, such as `x` or `gripper`.
     pub name: String,
-    /// Lowest value, where there is one.
+    /// Lower bound, if there is one.
     #[serde(deserialize_with = "strict::optional_float")]
     pub low: Option<f32>,
-    /// Highest value, where there is one.
+    /// Upper bound, if there is one.
     #[serde(deserialize_with = "strict::optional_float")]
     pub high: Option<f32>,
-    /// Whether only the whole numbers from `low` to `high` count.
+    /// Whether only the whole numbers from `low` to `high` are valid.
     pub discrete: bool,
 }
 
@@ -29,48 +29,49 @@ pub struct Dimension {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskDescription {
-    /// Its name; of the Bridge tasks, SIMPLER's.
+    /// Name of the task. The Bridge tasks have SIMPLER's names.
     pub task: String,
-    /// `default`, or what is changed.
+    /// `default`, or the name of what is changed.
     pub variant: String,
-    /// Rises when results of the task may change.
+    /// Increases when results of the task may change.
     pub version: u32,
-    /// What the robot is told to do.
+    /// The language instruction for the robot.
     pub instruction: String,
-    /// Steps after which an episode is truncated.
+    /// Horizon: an episode is truncated after so many steps.
     pub steps_max: u32,
-    /// Control steps per second of simulated time, where it is known.
+    /// Control steps per second of simulated time, if known.
     #[serde(deserialize_with = "strict::optional_float")]
     pub control_hz: Option<f32>,
-    /// Fixed layouts, numbered from 0; the random ones lie beside them.
+    /// Number of fixed initial layouts, numbered from 0. Random layouts exist in addition to them.
     pub layouts: u32,
-    /// What the numbers of a state are.
+    /// The dimensions of a state.
     pub state: Vec<Dimension>,
-    /// What the numbers of an action are.
+    /// The dimensions of an action.
     pub action: Vec<Dimension>,
 }
 
-/// The answer to a query on `describe`.
+/// The reply to a query on `describe`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
-    /// Version of the protocol that the server speaks.
+    /// Version of the protocol that the server uses.
     pub protocol: u32,
     /// The server's id, as in its keys.
     pub server: String,
     /// Name of the simulator.
     pub simulator: String,
-    /// Its version, with that of the physics engine; results are comparable within one of these.
+    /// Its version with the version of the physics engine. Results are comparable only within one
+    /// such version.
     pub simulator_version: String,
     /// Every task in every variant.
     pub tasks: Vec<TaskDescription>,
-    /// Largest height and width of an image; 0 where there are none.
+    /// Maximum height and width of an image; 0 if the server has no images.
     pub image_side_max: u32,
     /// Sessions in use.
     pub sessions: u32,
-    /// Sessions that can be in use.
+    /// Maximum number of sessions in use.
     pub sessions_max: u32,
-    /// Save slots of a session.
+    /// Number of save slots of a session.
     pub slots_max: u32,
 }
 

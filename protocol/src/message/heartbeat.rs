@@ -1,4 +1,5 @@
-//! The sign that a server's simulation moves, which its liveliness token cannot give.
+//! Proof that a server's simulation is making progress; its liveliness token shows only that the
+//! process exists.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,7 +7,7 @@ use super::value;
 use crate::codec::Message;
 use crate::limits::{HEARTBEAT_BYTES_MAX, SESSIONS_MAX};
 
-/// Sent by the thread that steps the worlds, about twice a second.
+/// Sent about twice a second by the thread that steps the environments.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Heartbeat {
@@ -14,9 +15,9 @@ pub struct Heartbeat {
     pub server: String,
     /// Sessions in use.
     pub sessions: u32,
-    /// Control steps since the server's start.
+    /// Control steps since the server started.
     pub steps: u64,
-    /// Memory that the process holds.
+    /// Resident memory of the process.
     pub resident_bytes: u64,
 }
 

@@ -1,4 +1,4 @@
-//! The messages, in the order in which an agent meets them.
+//! The messages, in the order in which an agent uses them.
 
 mod description;
 mod heartbeat;

@@ -1,4 +1,4 @@
-//! What a policy sees before a decision.
+//! The input of a policy's decision.
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::{strict, value};
 use crate::limits::{ACTION_DIMENSIONS_MAX, STATE_DIMENSIONS_MAX};
 
-/// A picture; 0 x 0 where none was asked for.
+/// An RGB image; 0 x 0 if the session has no images.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Image {
@@ -14,23 +14,25 @@ pub struct Image {
     pub height: usize,
     /// Columns.
     pub width: usize,
-    /// height × width × 3 bytes: rows from the top, red green blue.
+    /// height × width × 3 bytes, 8 bits per channel: rows from the top, each pixel red, green,
+    /// blue.
     pub pixels: Bytes,
 }
 
-/// Everything that a policy may know, and on request the expert's opinion.
+/// Everything that a policy may use and, on request, the scripted expert's action.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Observation {
-    /// The camera's picture in the size that was asked for at `Open`.
+    /// The camera image, in the size requested by `Open`.
     pub image: Image,
-    /// As the task's description says. Of a Bridge task: x y z in metres, roll pitch yaw in radians, 0, gripper
-    /// opening 0 to 1; base frame.
+    /// The robot's state, with the dimensions in the task's description. For a Bridge task: x, y, z
+    /// in metres, roll, pitch, yaw in radians, 0, and the gripper opening from 0 to 1, in the base
+    /// frame.
     #[serde(deserialize_with = "strict::floats")]
     pub state: Vec<f32>,
-    /// What the robot is told to do.
+    /// The language instruction for the robot.
     pub instruction: String,
-    /// The scripted expert's action at this state; only in a session opened with `expert`.
+    /// The scripted expert's action in this state; only in a session opened with `expert`.
     #[serde(deserialize_with = "strict::optional_floats")]
     pub expert_action: Option<Vec<f32>>,
 }
@@ -62,7 +64,7 @@ impl Observation {
         self.validate_rest()
     }
 
-    /// All but the image.
+    /// All fields except the image.
     pub(super) fn validate_rest(&self) -> Result<(), String> {
         value::length("state", self.state.len(), 0, STATE_DIMENSIONS_MAX)?;
         value::finite("state", &self.state)?;

@@ -10,34 +10,34 @@ use crate::limits::{OPEN_BYTES_MAX, OPENING_BYTES_MAX};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Open {
-    /// Version of the protocol that the agent speaks; another one is refused.
+    /// Version of the protocol that the agent uses; any other version is refused.
     pub protocol: u32,
-    /// The task that comes first, so that the server can prepare it; every `Reset` names its own.
+    /// The first task, so that the server can prepare it. Every `Reset` names its own task.
     pub task: String,
     /// Its variant.
     pub variant: String,
-    /// Rows of every image in this session; with 0 x 0, observations come without one.
+    /// Height of every image in this session. With 0 x 0, observations have no image.
     pub image_height: u32,
-    /// Columns of every image in this session.
+    /// Width of every image in this session.
     pub image_width: u32,
-    /// Whether observations carry the scripted expert's action: for evaluation only.
+    /// Whether observations include the scripted expert's action; for evaluation only.
     pub expert: bool,
-    /// Who asks, for the server's log.
+    /// Name of the agent, for the server's log.
     pub holder: String,
 }
 
-/// The answer to it.
+/// The reply to [`Open`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub enum Opening {
-    /// The session is the asker's for as long as its liveliness token stands.
+    /// The session belongs to the agent as long as the agent's liveliness token exists.
     Opened {
         /// The session's id, as in its keys.
         session: String,
     },
-    /// There is no session for the asker.
+    /// The agent gets no session.
     Refused {
-        /// What was expected and what came.
+        /// What was expected and what was received.
         reason: String,
     },
 }

@@ -1,4 +1,4 @@
-//! What became of one episode, for observers.
+//! The outcome of one episode, published for observers.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,43 +6,43 @@ use super::{Statistics, strict, value};
 use crate::codec::Message;
 use crate::limits::{OUTCOME_BYTES_MAX, SEED_END};
 
-/// Published once for each episode that ran to its end; an episode that broke has none.
+/// Published once for each episode that reached its end; an episode that ended in a fault has none.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EpisodeOutcome {
     /// The run that the episode belongs to.
     pub run: String,
-    /// Its name in the server's description.
+    /// Name of the task in the server's description.
     pub task: String,
-    /// `default`, or what is changed.
+    /// `default`, or the name of what is changed.
     pub variant: String,
-    /// One of the fixed layouts; none: a random layout.
+    /// Number of the fixed initial layout; `None` for a random layout.
     #[serde(deserialize_with = "strict::optional")]
     pub layout: Option<u32>,
-    /// Of the layout.
+    /// Seed of the layout.
     pub seed: u64,
-    /// Number of the episode within task and variant.
+    /// Number of the episode within its task and variant.
     pub episode: u32,
-    /// How the candidate was chosen.
+    /// The strategy that selected the candidates.
     pub strategy: String,
     /// Candidates per step.
     pub candidates: u32,
-    /// Of the sampling.
+    /// Sampling temperature.
     #[serde(deserialize_with = "strict::float")]
     pub temperature: f32,
     /// Digest of the policy's weights.
     pub policy: String,
-    /// Digest of the verifier's weights, when one scored.
+    /// Digest of the verifier's weights, if the strategy used one.
     #[serde(deserialize_with = "strict::optional")]
     pub verifier: Option<String>,
-    /// As of the last step.
+    /// The statistics at the last step.
     pub statistics: Statistics,
-    /// Control steps.
+    /// Number of control steps.
     pub steps: u32,
-    /// Mean score of the executed candidates, when a verifier scored.
+    /// Mean score of the executed candidates, if a verifier scored them.
     #[serde(deserialize_with = "strict::optional_float")]
     pub score_mean: Option<f32>,
-    /// The simulator with its version.
+    /// The simulator and its version.
     pub simulator: String,
 }
 

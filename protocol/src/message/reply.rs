@@ -1,4 +1,4 @@
-//! What a server answers, echoing the request's number.
+//! A server's reply, which repeats the request's number.
 
 use std::fmt;
 
@@ -12,92 +12,94 @@ use crate::limits::REPLY_BYTES_MAX;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Transition {
-    /// After the step.
+    /// The observation after the step.
     pub observation: Observation,
-    /// As of this step.
+    /// The statistics at this step.
     pub statistics: Statistics,
-    /// 1 when the task is solved at this step, else 0.
+    /// 1 if the task is solved at this step, otherwise 0.
     #[serde(deserialize_with = "strict::float")]
     pub reward: f32,
-    /// The task itself ended the episode.
+    /// The task ended the episode.
     pub terminated: bool,
-    /// The horizon ended the episode.
+    /// The episode reached its horizon.
     pub truncated: bool,
 }
 
-/// What broke in the world.
+/// What failed in the environment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum FaultKind {
-    /// The physics left the finite or the plausible.
+    /// The physics became infinite or implausible.
     PhysicsDiverged,
-    /// No picture could be made.
+    /// No image could be rendered.
     RendererUnavailable,
-    /// Anything else: a defect of the server, told in its log.
+    /// Anything else: a defect of the server, described in its log.
     Internal,
 }
 
-/// Exactly one for each request that is not older than the last one.
+/// Sent exactly once for each request that is not older than the last one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub enum Reply {
-    /// To `Reset`.
+    /// Reply to `Reset`.
     Observed {
         /// The request's number.
         sequence: u64,
-        /// At the episode's start.
+        /// The observation at the start of the episode.
         observation: Observation,
     },
-    /// To `Step`.
+    /// Reply to `Step`.
     Stepped {
         /// The request's number.
         sequence: u64,
         /// The step's result.
         transition: Transition,
-        /// None: the image is whole. Else its `pixels` are those of these tiles of 16 x 16 pixels only, numbered row by
-        /// row, one tile after the other; the others are as in the session's last observation ([`super::Image::complete`]).
+        /// `None`: the image is complete. Otherwise `pixels` holds only these tiles of 16 x 16
+        /// pixels, one after the other; tiles are numbered row by row. All other tiles are as in
+        /// the session's last observation ([`super::Image::complete`]).
         #[serde(deserialize_with = "strict::optional")]
         changed_tiles: Option<Vec<u32>>,
-        /// Microseconds that the simulator took for it: physics, picture and judge, without the wire.
+        /// Time in the simulator in microseconds: physics, rendering and success check, without the
+        /// transport.
         simulator_us: u32,
     },
-    /// To `Save`.
+    /// Reply to `Save`.
     Saved {
         /// The request's number.
         sequence: u64,
     },
-    /// To `Restore`.
+    /// Reply to `Restore`.
     Restored {
         /// The request's number.
         sequence: u64,
-        /// At the restored state.
+        /// The observation in the restored state.
         observation: Observation,
     },
-    /// To `Close`.
+    /// Reply to `Close`.
     Closed {
         /// The request's number.
         sequence: u64,
     },
-    /// The request was wrong; the world is unchanged. Number 0 when the request's own could not be read, or when the
-    /// session has ended.
+    /// The request was invalid and the environment is unchanged. The number is 0 if the request
+    /// could not be decoded or the session has ended.
     Refused {
         /// The request's number, or 0.
         sequence: u64,
-        /// What was expected and what came.
+        /// What was expected and what was received.
         reason: String,
     },
-    /// The world broke: the episode is void, and only `Reset` or `Close` can follow.
+    /// The environment failed. The episode is void; only `Reset` or `Close` may follow.
     Faulted {
         /// The request's number.
         sequence: u64,
-        /// What broke.
+        /// What failed.
         kind: FaultKind,
-        /// In short; the server's log has more.
+        /// A short reason; the server's log has the details.
         reason: String,
     },
 }
 
 impl Reply {
-    /// The number of the request that this answers; 0 when that is unknown.
+    /// The number of the request that this replies to; 0 if it is unknown.
     pub fn sequence(&self) -> u64 {
         match self {
             Reply::Observed { sequence, .. }
@@ -110,7 +112,7 @@ impl Reply {
         }
     }
 
-    /// The message's name, for errors.
+    /// The name of the variant, for errors.
     pub fn kind(&self) -> &'static str {
         match self {
             Reply::Observed { .. } => "Observed",

@@ -1,4 +1,4 @@
-//! What the holder of a session asks, one at a time.
+//! The requests of a session's holder, sent one at a time.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,34 +6,35 @@ use super::{strict, value};
 use crate::codec::Message;
 use crate::limits::{ACTION_DIMENSIONS_MAX, REQUEST_BYTES_MAX, SEED_END, SLOTS_MAX};
 
-/// Everything that decides an episode's start.
+/// Everything that determines the start of an episode.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Reset {
-    /// Its name in the server's description.
+    /// Name of the task in the server's description.
     pub task: String,
-    /// `default`, or what is changed.
+    /// `default`, or the name of what is changed.
     pub variant: String,
-    /// One of the fixed layouts; none draws a layout from the seed.
+    /// Number of the fixed initial layout; `None` generates a layout from the seed.
     pub layout: Option<u32>,
     /// Below 2^53.
     pub seed: u64,
 }
 
-/// Every request carries its number in the session: 1, 2, 3 and so on.
+/// A request. Its number in the session counts 1, 2, 3 and so on.
 ///
-/// The same number again is answered with the same bytes again, a lower one with silence, a gap is refused.
+/// The server answers a repeated number with the same bytes again, ignores a lower number, and
+/// refuses a gap.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub enum Request {
-    /// Starts an episode; ends the one before. Answered with `Observed`.
+    /// Starts an episode and ends the previous one. Answered with `Observed`.
     Reset {
         /// This request's number.
         sequence: u64,
-        /// Its name in the server's description.
+        /// Name of the task in the server's description.
         task: String,
-        /// `default`, or what is changed.
+        /// `default`, or the name of what is changed.
         variant: String,
-        /// One of the fixed layouts; none draws a layout from the seed.
+        /// Number of the fixed initial layout; `None` generates a layout from the seed.
         #[serde(deserialize_with = "strict::optional")]
         layout: Option<u32>,
         /// Below 2^53.
@@ -43,23 +44,24 @@ pub enum Request {
     Step {
         /// This request's number.
         sequence: u64,
-        /// As the task's description says. In a Bridge task: translation in metres, rotation vector in radians,
-        /// gripper +1 open or -1 closed; base frame.
+        /// The action, with the dimensions in the task's description. For a Bridge task:
+        /// translation in metres, rotation vector in radians, gripper +1 open or -1 closed, in the
+        /// base frame.
         #[serde(deserialize_with = "strict::floats")]
         action: Vec<f32>,
     },
-    /// Keeps the state in a slot until the next `Reset`. Answered with `Saved`.
+    /// Saves the state in a slot until the next `Reset`. Answered with `Saved`.
     Save {
         /// This request's number.
         sequence: u64,
-        /// From 0.
+        /// Number of the slot, from 0.
         slot: u32,
     },
-    /// Goes back to the state in a slot, bit by bit. Answered with `Restored`.
+    /// Restores the state in a slot, bit by bit. Answered with `Restored`.
     Restore {
         /// This request's number.
         sequence: u64,
-        /// From 0.
+        /// Number of the slot, from 0.
         slot: u32,
     },
     /// Ends the session. Answered with `Closed`.

@@ -1,8 +1,8 @@
-//! SIMPLER's episode statistics, judged by the server alone.
+//! SIMPLER's episode statistics. Only the server computes them.
 
 use serde::{Deserialize, Serialize};
 
-/// All as of one step; the last step's are the episode's.
+/// The statistics at one step; those of the last step are the episode's.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Statistics {
@@ -10,11 +10,11 @@ pub struct Statistics {
     pub is_success: bool,
     /// The gripper holds the source object at this step.
     pub is_grasped: bool,
-    /// It has held it at some step.
+    /// The gripper has held the source object at some step.
     pub ever_grasped: bool,
-    /// It has held it over several steps in a row.
+    /// The gripper has held the source object for several consecutive steps.
     pub consecutive_grasp: bool,
-    /// The source object has moved, and no other.
+    /// The source object has moved and no other object has.
     pub moved_correct_object: bool,
     /// Another object has moved.
     pub moved_wrong_object: bool,

@@ -1,8 +1,9 @@
-//! What serde alone would let pass: doubles and integers for 32-bit floats, and optional fields that are left out.
+//! Deserializers that are stricter than serde's: no doubles or integers for 32-bit floats, no
+//! missing optional fields.
 
 use serde::de::{Deserialize, Deserializer, Error, Visitor};
 
-/// A float that had 32 bits on the wire.
+/// A float that was encoded in 32 bits.
 struct Single(f32);
 
 impl<'de> Deserialize<'de> for Single {
@@ -32,19 +33,20 @@ pub fn floats<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f32>, D:
     Ok(singles.into_iter().map(|single| single.0).collect())
 }
 
-/// For `#[serde(deserialize_with)]` on an `Option` without floats: nil may stand there, but the field must.
+/// For `#[serde(deserialize_with)]` on an `Option` without floats: the value may be nil, but the
+/// field must be present.
 pub fn optional<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
     deserializer: D,
 ) -> Result<Option<T>, D::Error> {
     Option::deserialize(deserializer)
 }
 
-/// The same on `Option<f32>`.
+/// The same for `Option<f32>`.
 pub fn optional_float<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f32>, D::Error> {
     Ok(Option::<Single>::deserialize(deserializer)?.map(|single| single.0))
 }
 
-/// The same on `Option<Vec<f32>>`.
+/// The same for `Option<Vec<f32>>`.
 pub fn optional_floats<'de, D: Deserializer<'de>>(
     deserializer: D,
 ) -> Result<Option<Vec<f32>>, D::Error> {

@@ -1,17 +1,19 @@
-//! A step's picture as the parts of it that changed: a camera that stands still sees most of the last picture again.
+//! Delta encoding of a step's image: only the tiles that changed are sent. A fixed camera repeats
+//! most of the previous image.
 
 use bytes::{Bytes, BytesMut};
 
 use super::Image;
 use crate::limits::TILE_SIDE;
 
-/// Bytes of a tile's row, and of a tile.
+/// Bytes in one row of a tile, and in a tile.
 const ROW: usize = TILE_SIDE * 3;
 const TILE: usize = TILE_SIDE * ROW;
 
 impl Image {
-    /// The tiles in which this differs from `last`, ascending, and their pixels. None where the whole picture is to be
-    /// sent: `last` has another size, a side is no multiple of a tile's, or more than half of it is new.
+    /// The tiles in which this image differs from `last`, in ascending order, and their pixels.
+    /// `None` if the whole image should be sent: `last` has another size, a side is not a multiple
+    /// of a tile's side, or more than half of the tiles changed.
     pub fn changes(&self, last: &Image) -> Option<(Vec<u32>, Bytes)> {
         let count = self.tiles()?;
         if (self.height, self.width) != (last.height, last.width) {
@@ -28,7 +30,7 @@ impl Image {
         Some((tiles, pixels.into()))
     }
 
-    /// Numbers of the tiles that differ in two images of one size.
+    /// Numbers of the tiles that differ between two images of the same size.
     fn differing(&self, last: &Image) -> Vec<u32> {
         let line = self.width * 3;
         let bands = self.pixels.chunks_exact(TILE_SIDE * line);
@@ -36,7 +38,7 @@ impl Image {
         let mut number = 0;
         let mut differs = vec![0; line];
         for (new, old) in bands.zip(last.pixels.chunks_exact(TILE_SIDE * line)) {
-            // Whole lines in the order of the bytes: what a processor does fast.
+            // Whole lines in memory order, which the compiler can vectorise.
             differs.fill(0);
             for (new, old) in new.chunks_exact(line).zip(old.chunks_exact(line)) {
                 for ((differs, new), old) in differs.iter_mut().zip(new).zip(old) {
@@ -53,8 +55,8 @@ impl Image {
         tiles
     }
 
-    /// Puts the whole picture in the place of these tiles of it, as a valid [`crate::Reply::Stepped`] has them. Writes
-    /// over `last` where nobody else holds its pixels.
+    /// Replaces the tiles of a valid [`crate::Reply::Stepped`] by the complete image. Overwrites
+    /// `last` in place if nothing else holds its pixels.
     pub fn complete(&mut self, tiles: &[u32], last: Image) -> Result<(), String> {
         let (expected, got) = ((last.height, last.width), (self.height, self.width));
         if got != expected {
@@ -73,7 +75,7 @@ impl Image {
         Ok(())
     }
 
-    /// Tiles' numbers and bytes that fit the size.
+    /// Checks that the numbers and the bytes of the tiles fit the size of the image.
     pub(super) fn validate_tiles(&self, tiles: &[u32]) -> Result<(), String> {
         self.validate_sides()?;
         let count = self.tiles().ok_or_else(|| {
@@ -101,14 +103,14 @@ impl Image {
         Ok(())
     }
 
-    /// How many tiles the whole has; none where a side is cut.
+    /// Number of tiles in the complete image; `None` if a side is not a multiple of a tile's side.
     fn tiles(&self) -> Option<usize> {
         let whole = self.height.is_multiple_of(TILE_SIDE) && self.width.is_multiple_of(TILE_SIDE);
         let count = (self.height / TILE_SIDE) * (self.width / TILE_SIDE);
         (whole && count > 0).then_some(count)
     }
 
-    /// Where the rows of a tile begin in the whole picture's bytes.
+    /// Offsets of the rows of a tile in the complete image.
     fn rows(&self, tile: u32) -> impl Iterator<Item = usize> + use<> {
         let (line, across) = (self.width * 3, self.width / TILE_SIDE);
         let first = tile as usize / across * TILE_SIDE * line + tile as usize % across * ROW;

@@ -1,10 +1,11 @@
-//! Checks of single values, worded once for every message.
+//! Checks of single values, so that all messages report the same errors.
 
 use crate::codec::first_value;
 use crate::limits::{ELEMENTS_MAX, NAME_BYTES_MAX, TEXT_BYTES_MAX};
 use crate::{PROTOCOL_VERSION, limits};
 
-/// A name: not empty, not long, and harmless in a terminal.
+/// A name is not empty, has a limited length and contains no control characters, which could change
+/// a terminal.
 pub fn name(field: &str, value: &str) -> Result<(), String> {
     if value.is_empty() || value.len() > NAME_BYTES_MAX {
         return Err(format!("{field}: expected 1 to {NAME_BYTES_MAX} bytes, got {}", value.len()));
@@ -18,7 +19,7 @@ pub fn name(field: &str, value: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// A text: not long.
+/// A text has a limited length.
 pub fn text(field: &str, value: &str) -> Result<(), String> {
     if value.len() > TEXT_BYTES_MAX {
         return Err(format!(
@@ -29,7 +30,7 @@ pub fn text(field: &str, value: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// A list that a peer may loop over.
+/// A list has a limited length, because a peer loops over it.
 pub fn elements(field: &str, length: usize) -> Result<(), String> {
     if length > ELEMENTS_MAX {
         return Err(format!("{field}: expected at most {ELEMENTS_MAX} elements, got {length}"));
@@ -37,7 +38,7 @@ pub fn elements(field: &str, length: usize) -> Result<(), String> {
     Ok(())
 }
 
-/// A list of so many numbers.
+/// A list of numbers has a length within these bounds.
 pub fn length(field: &str, length: usize, low: usize, high: usize) -> Result<(), String> {
     if !(low..=high).contains(&length) {
         return Err(format!("{field}: expected {low} to {high} numbers, got {length}"));
@@ -45,7 +46,7 @@ pub fn length(field: &str, length: usize, low: usize, high: usize) -> Result<(),
     Ok(())
 }
 
-/// Numbers without NaN and infinity.
+/// No number is NaN or infinite.
 pub fn finite(field: &str, values: &[f32]) -> Result<(), String> {
     match values.iter().position(|value| !value.is_finite()) {
         None => Ok(()),
@@ -56,7 +57,7 @@ pub fn finite(field: &str, values: &[f32]) -> Result<(), String> {
     }
 }
 
-/// A number above zero.
+/// The number is finite and above 0.
 pub fn positive(field: &str, value: f32) -> Result<(), String> {
     finite(field, &[value])?;
     if value <= 0.0 {
@@ -65,7 +66,7 @@ pub fn positive(field: &str, value: f32) -> Result<(), String> {
     Ok(())
 }
 
-/// A whole number in a range.
+/// The whole number is in this range.
 pub fn range(field: &str, value: u64, low: u64, high: u64) -> Result<(), String> {
     if !(low..=high).contains(&value) {
         return Err(format!("{field}: expected {low} to {high}, got {value}"));
@@ -73,7 +74,7 @@ pub fn range(field: &str, value: u64, low: u64, high: u64) -> Result<(), String>
     Ok(())
 }
 
-/// Both sides are 0 when no image is wanted.
+/// Both sides are 0 if no image is wanted; otherwise both are within the limit.
 pub fn image_sides(fields: [&str; 2], height: u64, width: u64) -> Result<(), String> {
     if (height, width) == (0, 0) {
         return Ok(());
@@ -82,12 +83,12 @@ pub fn image_sides(fields: [&str; 2], height: u64, width: u64) -> Result<(), Str
     range(fields[1], width, 1, limits::IMAGE_SIDE_MAX as u64)
 }
 
-/// A request's number; 0 stands in a reply to a request that could not be read.
+/// The number of a request; 0 occurs only in a reply to a request that could not be decoded.
 pub fn sequence(value: u64, low: u64) -> Result<(), String> {
     range("sequence", value, low, limits::SEED_END - 1)
 }
 
-/// The version of the peer.
+/// The peer uses the same version of the protocol.
 pub fn protocol(version: u32) -> Result<(), String> {
     if version != PROTOCOL_VERSION {
         return Err(format!("expected protocol {PROTOCOL_VERSION}, got protocol {version}"));
@@ -95,7 +96,7 @@ pub fn protocol(version: u32) -> Result<(), String> {
     Ok(())
 }
 
-/// The version of a peer whose message may have other fields than ours.
+/// Checks the version of a peer whose message may have other fields than ours.
 pub fn recognise_protocol(bytes: &[u8]) -> Result<(), String> {
     #[derive(serde::Deserialize)]
     struct Versioned {
@@ -103,7 +104,7 @@ pub fn recognise_protocol(bytes: &[u8]) -> Result<(), String> {
     }
     match first_value::<Versioned>(bytes) {
         Ok((versioned, _)) => protocol(versioned.protocol),
-        // Not even a version: the strict decoder has better words for it.
+        // There is no version to read: the strict decoder reports what is wrong.
         Err(_) => Ok(()),
     }
 }

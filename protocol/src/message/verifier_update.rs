@@ -1,4 +1,4 @@
-//! A newly trained verifier on its way to the agents.
+//! A newly trained verifier, published for agents.
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
@@ -7,7 +7,7 @@ use super::value;
 use crate::codec::Message;
 use crate::limits::VERIFIER_UPDATE_BYTES_MAX;
 
-/// The last one of each name is kept for those who come later.
+/// zenoh keeps the last update of each name for later subscribers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VerifierUpdate {
@@ -15,9 +15,10 @@ pub struct VerifierUpdate {
     pub name: String,
     /// SHA-256 of the weights, in hexadecimal.
     pub digest: String,
-    /// Digest of the policy whose hidden states it reads; agents with another policy ignore it.
+    /// Digest of the policy whose hidden states the verifier reads; an agent with another policy
+    /// ignores the update.
     pub policy: String,
-    /// A safetensors file.
+    /// The verifier as a safetensors file.
     pub weights: Bytes,
 }
 

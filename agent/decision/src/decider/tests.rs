@@ -84,7 +84,7 @@ async fn a_robot_without_a_well_formed_candidate_holds_still_with_its_last_gripp
 }
 
 #[tokio::test]
-async fn a_request_that_the_policy_cannot_answer_costs_no_other_its_decision() {
+async fn a_request_that_the_policy_fails_on_does_not_affect_the_others() {
     let policy = ScriptedPolicy::new()
         .with("bad", [Answer::Fails("logits are not finite".to_owned())])
         .with("good", [motions(&[Some(0.5)])]);
@@ -111,12 +111,12 @@ async fn a_scorer_that_fails_is_a_fault_of_its_episode_alone() {
     ];
     let decisions = decide(policy, &mut contexts).await;
     assert!(decisions[0].is_ok());
-    let reason = "the judge is silent".to_owned();
+    let reason = "the scripted scorer fails".to_owned();
     assert_eq!(decisions[1], Err(DecisionFault::Scorer { reason }));
 }
 
 #[tokio::test]
-async fn a_score_that_is_no_number_is_a_fault_and_not_a_choice() {
+async fn a_score_that_is_not_finite_is_a_fault() {
     let policy = ScriptedPolicy::new().with("go", [motions(&[Some(f32::MAX)])]);
     let scorer: Arc<dyn Scorer> = Arc::new(ScriptedScorer::new("overflow", f32::MAX));
     let mut contexts = [context(Strategy::Verifier, "go", Some(scorer))];
@@ -126,7 +126,7 @@ async fn a_score_that_is_no_number_is_a_fault_and_not_a_choice() {
 }
 
 #[tokio::test]
-async fn a_decision_does_not_depend_on_the_episodes_beside_it() {
+async fn a_decision_does_not_depend_on_the_other_episodes_of_the_batch() {
     let policy =
         || Arc::new(ScriptedPolicy::new().with("go", [motions(&[Some(0.1), Some(0.4), None])]));
     let scorer: Arc<dyn Scorer> = Arc::new(ScriptedScorer::new("far", 1.0));

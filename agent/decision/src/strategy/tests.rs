@@ -1,4 +1,4 @@
-//! Tests of the strategies on made-up candidates.
+//! Tests of the strategies on synthetic candidates.
 
 use super::*;
 use crate::ActionChunk;
@@ -14,7 +14,7 @@ fn owned(tokens: [u32; 7], action: [f32; 7]) -> Owned {
     Some((tokens.to_vec(), ActionChunk::single(action.to_vec()).expect("an action")))
 }
 
-/// A candidate whose first bin is `bin`; the other five continuous bins are alike.
+/// A candidate with `bin` as its first bin; its other five continuous bins are always the same.
 fn at(bin: u32, gripper: f32) -> Owned {
     let tokens = [bin, 500, 500, 500, 500, 500, if gripper > 0.0 { 599 } else { 400 }];
     owned(tokens, [bin as f32 * 1e-4, 0.0, 0.0, 0.0, 0.0, 0.0, gripper])
@@ -37,8 +37,8 @@ fn check(strategy: &str, candidates: &[Owned], logits: &[f32], expected: Option<
 }
 
 #[test]
-fn every_strategy_has_its_own_choice() {
-    // Candidates 1, 2 and 5 agree; 3 and 4 stand apart; 4 has the other gripper side.
+fn every_strategy_selects_its_own_candidate() {
+    // Candidates 1, 2 and 5 agree; 3 is far away; 4 has the opposite gripper command.
     let candidates =
         [at(470, 1.0), at(510, 1.0), at(512, 1.0), at(560, 1.0), at(511, -1.0), at(507, 1.0)];
     let logits = [0.5, -0.5, 0.0, 1.5, -2.0, 0.4];
@@ -62,7 +62,7 @@ fn malformed_candidates_are_never_chosen() {
     for strategy in &Strategy::ALL[2..] {
         check(strategy.name(), &[None, at(500, 1.0), None], &logits, Some(1));
     }
-    // One sample means one: a later candidate must not stand in for a malformed first one.
+    // A single sample is one candidate: a later candidate must not replace a malformed first one.
     check("sample", &[None, at(500, 1.0), None], &logits, None);
 }
 
@@ -72,7 +72,7 @@ fn ties_go_to_the_first() {
     for strategy in &Strategy::ALL[2..] {
         check(strategy.name(), &candidates, &[1.0; 4], Some(1));
     }
-    // Nobody agrees with anybody: the vote is a tie of all.
+    // No two candidates agree: all have the same number of votes.
     check("majority", &[at(400, 1.0), at(500, 1.0), at(600, 1.0)], &[0.0; 3], Some(0));
 }
 
@@ -81,7 +81,7 @@ fn majority_counts_votes_within_three_bins_on_the_same_gripper_side() {
     check("majority", &[at(500, 1.0), at(510, 1.0), at(513, 1.0)], &[0.0; 3], Some(1));
     check("majority", &[at(500, 1.0), at(510, 1.0), at(514, 1.0)], &[0.0; 3], Some(0));
     check("majority", &[at(500, 1.0), at(510, 1.0), at(510, -1.0)], &[0.0; 3], Some(0));
-    // 503 is near to both of its neighbours, which are not near to each other.
+    // 503 is near both of its neighbours, which are not near each other.
     check("majority", &[at(500, 1.0), at(503, 1.0), at(506, 1.0)], &[0.0; 3], Some(1));
 }
 
@@ -96,7 +96,8 @@ fn a_confident_verifier_overrules_agreement_and_an_indifferent_one_does_not() {
     let candidates = [440, 500, 503, 501, 502].map(|bin| at(bin, 1.0));
     check("verifier+medoid", &candidates, &[0.1, 0.0, 0.0, 0.0, 0.0], Some(3));
     check("verifier+medoid", &candidates, &[3.0, 0.0, 0.0, 0.0, 0.0], Some(0));
-    // The mean distances are 61.5/255 and 16.25/255: the weight's own turning point, from both sides.
+    // The mean distances are 61.5/255 and 16.25/255. Check both sides of the point where the
+    // decision changes.
     let turn = (MEDOID_WEIGHT_LOGITS * (61.5 - 16.25) / 255.0) as f32;
     check("verifier+medoid", &candidates, &[turn - 0.001, 0.0, 0.0, 0.0, 0.0], Some(3));
     check("verifier+medoid", &candidates, &[turn + 0.001, 0.0, 0.0, 0.0, 0.0], Some(0));
@@ -135,17 +136,18 @@ fn names_are_read_back() {
 
 #[test]
 #[should_panic(expected = "is finite")]
-fn a_score_that_is_no_number_is_a_bug() {
+fn a_score_that_is_not_finite_is_a_bug() {
     check("verifier", &[at(500, 1.0)], &[f32::NAN], Some(0));
 }
 
 #[test]
-fn candidates_without_tokens_are_compared_by_their_numbers() {
+fn candidates_without_tokens_are_compared_by_their_actions() {
     let bare = |x: f32, gripper: f32| -> Owned {
         let action = vec![x, 0.0, 0.0, 0.0, 0.0, 0.0, gripper];
         Some((Vec::new(), ActionChunk::single(action).expect("an action")))
     };
-    // One bin is 0.02 / 255 here: the first two agree, the others stand apart or on the other gripper side.
+    // One bin is 0.02 / 255 here. The first two agree; the others are far away or have the opposite
+    // gripper command.
     let candidates = [bare(0.01, 1.0), bare(0.0101, 1.0), bare(0.02, 1.0), bare(0.01, -1.0)];
     check("majority", &candidates, &[0.0; 4], Some(0));
     check("medoid", &candidates[..3], &[0.0; 3], Some(1));
@@ -157,7 +159,7 @@ fn all_actions_of_a_chunk_count() {
         let action = |x: f32| vec![x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
         Some((Vec::new(), ActionChunk::new(x.map(action).to_vec()).expect("a chunk")))
     };
-    // Equal first actions; the second ones decide.
+    // The first actions are equal; the second ones decide.
     let candidates = [chunk([0.01, 0.02]), chunk([0.01, 0.0]), chunk([0.01, 0.001])];
     check("medoid", &candidates, &[0.0; 3], Some(2));
 }

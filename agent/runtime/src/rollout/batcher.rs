@@ -1,7 +1,8 @@
-//! Decisions in batches: whatever episodes are ready share one pass of the policy.
+//! Batches decisions: all episodes that are ready share one forward pass of the policy.
 //!
-//! No episode waits for a server of another one. While a batch is decided, the episodes of the one before it are stepped
-//! and come back; a batch waits for its share of them, but never for long.
+//! No episode waits for another one's server. While a batch is computed, the episodes of the
+//! previous batch execute their steps. A batch waits for its share of the running episodes, but
+//! only for a short time.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -12,47 +13,48 @@ use tokio::runtime::Handle;
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
 
-/// How long a batch waits for its share of the running episodes: long enough for a step of a usual server, so that
-/// batches stay even, and too short to notice a slow one.
+/// Maximum wait of a batch for its share of the running episodes: long enough for a step of a
+/// typical server, so that batches have equal sizes, and short compared with a slow server.
 const BATCH_WAIT: Duration = Duration::from_millis(15);
-/// Batches that are decided side by side have at least so many episodes each: smaller ones share too little.
+/// Minimum number of episodes in each of several parallel batches; smaller batches share too little
+/// work.
 const EPISODES_MIN: usize = 3;
-/// Episodes that may wait to be read; every one of them is held by a worker of its own.
+/// Maximum number of episodes in the queue; each one is held by its own worker.
 const WAITING_MAX: usize = 4096;
 
-/// Hands episodes to the decider and their decisions back.
+/// Passes episodes to the decider and returns their decisions.
 pub struct DecisionBatcher {
     waiting: mpsc::Sender<Waiting>,
 }
 
-/// An episode that waits for its decision.
+/// An episode waiting for its decision.
 struct Waiting {
     observation: Observation,
     context: EpisodeContext,
     answer: oneshot::Sender<Answer>,
 }
 
-/// What comes back.
+/// The result for one episode.
 pub struct Answer {
-    /// The episode's memory, this decision included.
+    /// The episode's state, updated with this decision.
     pub context: EpisodeContext,
-    /// What to do.
+    /// The decision.
     pub decision: Result<Decision, DecisionFault>,
-    /// From the observations of the batch to its chosen actions.
+    /// Time from the observations of the batch to its chosen actions.
     pub batch_time: Duration,
-    /// Decisions that were made together.
+    /// Number of decisions in the batch.
     pub batch_size: usize,
 }
 
 impl DecisionBatcher {
-    /// Starts deciding in the background; `active` is the number of episodes that are running.
+    /// Starts the background task; `active` is the number of running episodes.
     pub fn start(decider: Arc<Decider>, active: Arc<AtomicUsize>) -> DecisionBatcher {
         let (waiting, received) = mpsc::channel(WAITING_MAX);
         tokio::spawn(decide_batches(decider, received, active));
         DecisionBatcher { waiting }
     }
 
-    /// Waits for a decision. None when the rollout is over.
+    /// Waits for a decision; `None` if the rollout has ended.
     pub async fn decide(
         &self,
         observation: Observation,
@@ -72,13 +74,14 @@ async fn decide_batches(
     let parallel = decider.policy().info().parallel_calls.max(1);
     let calls = Arc::new(Semaphore::new(parallel));
     loop {
-        // A batch grows while it waits for its turn.
+        // The batch grows while it waits for its turn.
         let Ok(turn) = Arc::clone(&calls).acquire_owned().await else { return };
         let Some(first) = received.recv().await else { return };
         let batch = gather(first, &mut received, &active, parallel).await;
         let (decider, runtime) = (Arc::clone(&decider), Handle::current());
-        // A policy computes on all cores for tens of milliseconds: not on a thread that others need for their steps.
-        // A panic is reported by its hook, and the episodes of the batch learn that their answer will not come.
+        // A policy uses all cores for tens of milliseconds, so it must not block a thread that
+        // other episodes need for their steps. A panic is reported by the panic hook; the episodes
+        // of the batch then get no answer.
         tokio::task::spawn_blocking(move || {
             runtime.block_on(decide(&decider, batch));
             drop(turn);
@@ -86,7 +89,8 @@ async fn decide_batches(
     }
 }
 
-/// Episodes that are ready, and those that become ready soon: a share of all that are running.
+/// Collects the episodes that are ready, and those that become ready soon, up to a share of all
+/// running episodes.
 async fn gather(
     first: Waiting,
     received: &mut mpsc::Receiver<Waiting>,
@@ -104,7 +108,7 @@ async fn gather(
     batch
 }
 
-/// Episodes of one batch when so many are running.
+/// Number of episodes per batch for this number of running episodes.
 fn share(active: usize, parallel: usize) -> usize {
     active.div_ceil((active / EPISODES_MIN).clamp(1, parallel))
 }
@@ -119,7 +123,7 @@ async fn decide(decider: &Decider, mut batch: Vec<Waiting>) {
     let (batch_time, batch_size) = (begun.elapsed(), batch.len());
     for (one, decision) in batch.into_iter().zip(decisions) {
         let answer = Answer { context: one.context, decision, batch_time, batch_size };
-        // The episode may have been dropped meanwhile.
+        // The episode may have been dropped in the meantime.
         let _ = one.answer.send(answer);
     }
 }
@@ -129,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn batches_side_by_side_share_the_running_episodes_and_few_episodes_stay_together() {
+    fn parallel_batches_share_the_episodes_and_small_batches_are_avoided() {
         let shares = |parallel: usize| [1, 2, 5, 6, 8, 16].map(|active| share(active, parallel));
         assert_eq!(shares(1), [1, 2, 5, 6, 8, 16]);
         assert_eq!(shares(2), [1, 2, 5, 3, 4, 8]);

@@ -1,4 +1,5 @@
-//! One attempt at an episode, from the reset to its record. What breaks on the way is a fault and leaves no record.
+//! One attempt at an episode, from the reset to its record. A failed attempt is a fault and has no
+//! record.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -17,20 +18,20 @@ use crate::fault::AttemptFault;
 use crate::session::{Environment, Episode, Session, SessionInfo, SessionPool};
 use crate::sinks::{Event, Sinks};
 
-/// What one attempt uses.
+/// Everything that one attempt uses.
 pub struct EpisodeRun<'a, P> {
     pub lease: &'a Lease,
     pub options: RecordOptions,
     pub versions: &'a Versions,
     pub policy: &'a PolicyInfo,
-    /// The same from the first step to the last, whatever is published meanwhile.
+    /// The scorer of the whole episode, even if a new verifier is published meanwhile.
     pub scorer: Option<Arc<dyn Scorer>>,
     pub batcher: &'a DecisionBatcher,
     pub sinks: &'a Sinks,
     pub pool: &'a P,
 }
 
-/// What is known of the episode so far.
+/// The state of a running episode.
 struct Progress {
     context: EpisodeContext,
     steps: Vec<StepRecord>,
@@ -38,7 +39,7 @@ struct Progress {
 }
 
 impl<P: SessionPool> EpisodeRun<'_, P> {
-    /// Runs the episode on a session; gives the session back with the record.
+    /// Runs the episode on a session; returns its record and the session.
     pub async fn run(
         &self,
         session: Session<P::Environment>,
@@ -68,7 +69,7 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
                 self.pool.lost(&info, &fault);
                 Err(fault.into())
             }
-            // The session is as good as before.
+            // The session is still usable.
             Err(fault) => {
                 self.pool.release(Session { info, environment: episode.finish() });
                 Err(fault)
@@ -100,7 +101,7 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
         Ok(progress)
     }
 
-    /// One decision, and the control steps that it covers.
+    /// One decision and the control steps that execute it.
     async fn step(
         &self,
         episode: &mut <P::Environment as Environment>::Episode,
@@ -144,7 +145,7 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
         Ok(Progress { context, steps, is_over })
     }
 
-    /// Sinks get frames only where somebody makes a video of them.
+    /// Frames are sent only if videos are requested.
     async fn emit_frame(&self, seen: &Observation, is_first: bool) -> Result<(), AttemptFault> {
         let id = self.lease.job.identity.id();
         let image = self.options.video.then(|| seen.image.clone());
@@ -173,14 +174,14 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
     }
 }
 
-/// A server is held to its own description: an episode ends at the task's horizon at the latest.
+/// Checks a server against its own description: an episode must end at the task's horizon.
 fn check_length(task: &TaskDescription, steps: usize) -> Result<(), AttemptFault> {
     let expected = task.steps_max as usize;
     if steps < expected {
         return Ok(());
     }
     Err(AttemptFault::Environment(crate::fault::EnvironmentFault::wire(format!(
-        "expected task {} to end after {expected} steps, as its description says, and it goes on",
+        "expected task {} to end after {expected} steps, the horizon in its description, but it did not",
         task.task
     ))))
 }
@@ -198,7 +199,7 @@ fn candidate_record(
     CandidateRecord {
         actions,
         malformed,
-        // A malformed candidate has no action whose success could be likely.
+        // A malformed candidate has no action, so it has no success probability.
         score: logit.filter(|_| is_well_formed).map(probability),
         log_probability: candidate.log_probability,
         log_probabilities: candidate.log_probabilities,

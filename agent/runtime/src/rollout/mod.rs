@@ -1,4 +1,5 @@
-//! Rollouts: many episodes at once, each at its own pace, with one policy that decides for whatever episodes are ready.
+//! Rollouts: many concurrent episodes, each at its own pace, with one policy that decides for all
+//! episodes that are ready.
 //!
 //! ```text
 //! EpisodeQueue ─lease─▶ worker ─▶ SessionPool ─▶ Environment::reset ─▶ Episode ─┐
@@ -7,8 +8,9 @@
 //!                         └─▶ EpisodeRecord ─▶ event sinks
 //! ```
 //!
-//! Settings may share a batch, for a decision does not depend on the episodes beside it. An episode that breaks is dropped
-//! alone, noted as a fault and run again; only an episode that ran to its end is recorded.
+//! Settings may share a batch, because a decision does not depend on the other episodes of the
+//! batch. A failed attempt is dropped, recorded as a fault and repeated; only an episode that ended
+//! is recorded.
 
 mod batcher;
 mod episode;
@@ -31,39 +33,40 @@ use crate::stop::{Stop, asked};
 use batcher::DecisionBatcher;
 use episode::EpisodeRun;
 
-/// What a candidate's record keeps.
+/// Optional content of records.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RecordOptions {
-    /// The hidden states of all candidates instead of the chosen one's.
+    /// Record the hidden states of all candidates, not only of the executed one.
     pub all_hidden: bool,
-    /// A video of every episode.
+    /// Record a video of every episode.
     pub video: bool,
 }
 
 /// Everything that a rollout uses.
 pub struct Rollout<P> {
-    /// Decides.
+    /// Makes the decisions.
     pub decider: Arc<Decider>,
-    /// The newest scorer; an episode keeps the one that it began with.
+    /// The newest scorer; an episode keeps the scorer that it started with.
     pub scorer: watch::Receiver<Option<Arc<dyn Scorer>>>,
     /// Opens sessions.
     pub pool: P,
-    /// What is to be run.
+    /// The episodes to run.
     pub queue: Arc<dyn EpisodeQueue>,
-    /// Where events go.
+    /// Receive the events.
     pub sinks: Sinks,
-    /// Episodes at once.
+    /// Maximum number of concurrent episodes.
     pub sessions: usize,
-    /// What records hold.
+    /// Optional content of records.
     pub options: RecordOptions,
-    /// What records say they were made with; simulator, policy and verifier are filled in.
+    /// The versions in records; simulator, policy and verifier are filled in.
     pub versions: Versions,
-    /// Asked between episodes.
+    /// Checked between episodes.
     pub stop: watch::Receiver<Stop>,
 }
 
 impl<P: SessionPool> Rollout<P> {
-    /// Runs the queue to its end, or until it is stopped. What was recorded is durable when this returns.
+    /// Runs until the queue is finished or the run is stopped. All records are durable when this
+    /// returns.
     pub async fn run(self) -> Result<()> {
         let stop = self.stop.clone();
         let sessions = self.sessions;
@@ -93,20 +96,20 @@ impl<P: SessionPool> Rollout<P> {
         };
         workers.shutdown().await;
         let shared = Arc::into_inner(shared).context("a worker outlived the rollout")?;
-        // Why the run ended matters more than what the sinks say about it.
+        // The reason why the run ended takes precedence over errors of the sinks.
         result.and(shared.rollout.sinks.finish().await)
     }
 }
 
-/// What the workers share.
+/// The state shared by the workers.
 struct Shared<P> {
     rollout: Rollout<P>,
     batcher: DecisionBatcher,
-    /// Episodes between reset and end.
+    /// Number of episodes between reset and end.
     active: Arc<AtomicUsize>,
-    /// Leases that workers hold.
+    /// Number of leases held by workers.
     leased: AtomicUsize,
-    /// A lease was completed, failed or released.
+    /// Notified when a lease was completed, failed or released.
     returned: Notify,
 }
 
@@ -121,7 +124,7 @@ impl<P: SessionPool> Shared<P> {
         Ok(())
     }
 
-    /// The next episode; none when there is none left or the run is to end.
+    /// The next episode; `None` if none is left or the run is stopping.
     async fn next_lease(&self) -> Result<Option<Lease>> {
         loop {
             let returned = self.returned.notified();
@@ -132,7 +135,7 @@ impl<P: SessionPool> Shared<P> {
             if let Some(lease) = self.rollout.queue.lease().await? {
                 return Ok(Some(lease));
             }
-            // What others hold may fail and come back.
+            // Leases of other workers may fail and return to the queue.
             if self.leased.fetch_sub(1, Ordering::AcqRel) == 1 {
                 self.returned.notify_waiters();
                 return Ok(None);
@@ -209,14 +212,14 @@ impl<P: SessionPool> Shared<P> {
     }
 }
 
-/// What to say of an episode in which the robot held still from beginning to end.
+/// The notice about an episode in which the robot held still from start to end.
 fn never_acted(record: &EpisodeRecord) -> String {
     let decisions = record.decisions().count();
     let first = record.decisions().flat_map(|decision| &decision.candidates).next();
     let reason = first.and_then(|candidate| candidate.malformed.as_deref()).unwrap_or("none");
     format!(
-        "{}: {decisions} of {decisions} decisions held: the policy never acted, so this episode has no outcome; its first \
-         candidate: {reason}",
+        "{}: the policy never acted, because none of {decisions} decisions had a well-formed \
+         candidate; the episode has no outcome; first candidate: {reason}",
         record.identity.id()
     )
 }

@@ -1,4 +1,5 @@
-//! Rollouts with scripted policies, scorers and environments: what no real one does on request.
+//! Rollouts with scripted policies, scorers and environments, for situations that real ones do not
+//! produce on request.
 
 use std::collections::BTreeSet;
 use std::sync::Mutex;
@@ -13,7 +14,7 @@ use super::*;
 use crate::scripted::{STEPS_MAX, Script, ScriptedPool};
 use crate::sinks::EventSink;
 
-/// Keeps every event.
+/// Collects all events.
 #[derive(Clone, Default)]
 struct Kept(Arc<Mutex<Vec<Event>>>);
 
@@ -55,7 +56,7 @@ impl Kept {
     }
 }
 
-/// Everything around a rollout that a test looks at or changes.
+/// A rollout and everything that a test inspects or changes.
 struct Stage {
     rollout: Rollout<ScriptedPool>,
     queue: Arc<RunQueue>,
@@ -111,7 +112,7 @@ async fn every_episode_is_recorded_once_with_all_its_steps() {
 }
 
 #[tokio::test]
-async fn a_fault_in_reset_or_in_a_step_is_run_again_and_leaves_no_record() {
+async fn an_episode_with_a_fault_is_run_again_and_the_fault_has_no_record() {
     let pool = ScriptedPool::new(&[
         ("reset", &[Script::BreaksInReset, Script::Succeeds]),
         ("step", &[Script::BreaksInStep, Script::Succeeds]),
@@ -124,13 +125,13 @@ async fn a_fault_in_reset_or_in_a_step_is_run_again_and_leaves_no_record() {
         faults,
         [
             "physics diverged: a cube left the table at the speed of light",
-            "server scripted is gone"
+            "server scripted was lost: its process ended"
         ]
     );
 }
 
 #[tokio::test]
-async fn an_episode_that_always_breaks_is_given_up_and_costs_no_other() {
+async fn an_episode_that_always_fails_is_given_up_and_affects_no_other() {
     let pool = ScriptedPool::new(&[("bad", &[Script::BreaksInStep])]);
     let (kept, queue) = run(&["bad", "good"], pool, ScriptedPolicy::new()).await;
     assert_eq!(kept.records().len(), 1);
@@ -152,7 +153,7 @@ async fn an_episode_that_does_not_end_at_its_horizon_is_a_fault_of_its_server() 
 }
 
 #[tokio::test]
-async fn a_held_step_is_recorded_and_an_episode_that_never_acted_is_no_outcome() {
+async fn a_held_step_is_recorded_and_an_episode_that_never_acted_has_no_outcome() {
     let motions = |motions: &[Option<f32>]| Answer::Motions(motions.to_vec());
     let policy = ScriptedPolicy::new()
         .with("mute", [motions(&[None])])
@@ -166,7 +167,11 @@ async fn a_held_step_is_recorded_and_an_episode_that_never_acted_is_no_outcome()
     assert_eq!(chosen, [None, Some(0), Some(0)]);
     assert_eq!(once.steps[0].action, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], "it held still");
     assert!(kept.faults().is_empty());
-    assert!(kept.notices().iter().any(|line| line.contains("3 of 3 decisions held")));
+    assert!(
+        kept.notices()
+            .iter()
+            .any(|line| line.contains("none of 3 decisions had a well-formed candidate"))
+    );
     assert_eq!(queue.progress().await.expect("progress").completed, 2);
 }
 
@@ -178,16 +183,16 @@ async fn a_policy_or_a_scorer_that_fails_is_a_fault_of_its_episode_alone() {
         stage(policy, &pool, &["bad", "judged", "good"], Strategy::Verifier);
     let judge = ScriptedScorer::new("judge", 1.0).failing_for("judged");
     scorer.send_replace(Some(Arc::new(judge)));
-    rollout.run().await.expect("the run goes on");
+    rollout.run().await.expect("the run continues");
     let records = kept.records();
     assert_eq!(records.len(), 1);
     assert_eq!(records[0].identity.task, "good");
     assert_eq!(records[0].versions.verifier.as_deref(), Some("judge"));
     let faults: BTreeSet<String> = kept.faults().into_iter().collect();
-    let expected = ["policy: out of memory", "scorer: the judge is silent"];
+    let expected = ["policy: out of memory", "scorer: the scripted scorer fails"];
     assert_eq!(faults, expected.map(str::to_owned).into());
     let released = pool.events().iter().filter(|event| *event == "released").count();
-    assert_eq!(released, 1 + 2 * ATTEMPTS_MAX as usize, "sessions are as good as before");
+    assert_eq!(released, 1 + 2 * ATTEMPTS_MAX as usize, "sessions are still usable");
 }
 
 #[tokio::test]
@@ -208,7 +213,7 @@ async fn an_episode_keeps_its_verifier_and_the_next_one_takes_the_newer() {
 }
 
 #[tokio::test]
-async fn stopping_after_finishes_what_runs_and_stopping_now_drops_it() {
+async fn stopping_once_finishes_running_episodes_and_stopping_now_discards_them() {
     for (how, recorded) in [(Stop::Finish, 2), (Stop::Now, 0)] {
         let pool = ScriptedPool::new(&[("a", &[Script::Waits]), ("b", &[Script::Waits])]);
         let policy = ScriptedPolicy::new();
@@ -228,7 +233,7 @@ async fn stopping_after_finishes_what_runs_and_stopping_now_drops_it() {
 }
 
 #[tokio::test]
-async fn a_slow_episode_holds_up_no_other() {
+async fn a_slow_episode_does_not_delay_others() {
     let pool = ScriptedPool::new(&[("slow", &[Script::Waits])]);
     let policy = ScriptedPolicy::new();
     let Stage { rollout, kept, .. } =
@@ -266,5 +271,5 @@ async fn a_run_without_any_session_ends_with_the_pools_reason() {
     let pool = ScriptedPool::empty();
     let Stage { rollout, .. } = stage(ScriptedPolicy::new(), &pool, &["a"], Strategy::Medoid);
     let error = rollout.run().await.expect_err("nothing can be run");
-    assert!(error.to_string().contains("no session of a"), "{error:#}");
+    assert!(error.to_string().contains("no session of task a"), "{error:#}");
 }

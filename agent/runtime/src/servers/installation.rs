@@ -1,6 +1,7 @@
-//! Where the program's own files are: in a checkout, or embedded in the program and unpacked.
+//! Locates the program's own files: in a checkout, or embedded in the program and unpacked.
 //!
-//! Both have the same layout, `env-server/` and `agent/models/`, so that nothing else needs to know which it is.
+//! Both have the same layout, `env-server/` and `agent/models/`, so that other code need not
+//! distinguish them.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -11,38 +12,38 @@ use anyhow::{Context, Result};
 use flate2::read::GzDecoder;
 use tempfile::TempDir;
 
-/// Present in every checkout and in every unpacked copy.
+/// Files that exist in every checkout and in every unpacked copy.
 const LANDMARKS: [&str; 2] =
     ["env-server/rever_env/__main__.py", "agent/models/bridge-small/config.json"];
-/// As much of a digest as tells builds apart.
+/// Length of the digest prefix that distinguishes builds.
 const DIGEST_CHARACTERS: usize = 12;
 
-/// What `main` reads of the process's surroundings, once.
+/// The environment of the process, read once by `main`.
 #[derive(Debug, Clone, Default)]
 pub struct Host {
-    /// The file that this program was started from.
+    /// Path of this program.
     pub program: Option<PathBuf>,
-    /// The current folder.
+    /// The current working directory.
     pub folder: Option<PathBuf>,
     /// The environment variables.
     pub variables: BTreeMap<OsString, OsString>,
 }
 
-/// Files embedded in a program.
+/// The files embedded in a program.
 #[derive(Debug, Clone, Copy)]
 pub struct Bundle {
-    /// A compressed archive (`.tar.gz`) in the layout of a checkout.
+    /// A compressed archive (`.tar.gz`) with the layout of a checkout.
     pub archive: &'static [u8],
-    /// Of the archive, in hexadecimal.
+    /// SHA-256 of the archive in hexadecimal.
     pub digest: &'static str,
 }
 
-/// What to do about something that is missing.
+/// How to handle missing dependencies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Missing {
-    /// Install it.
+    /// Install them.
     Install,
-    /// Report it as an error, and change nothing on this machine.
+    /// Report them as an error and change nothing on this machine.
     Report,
 }
 
@@ -51,17 +52,18 @@ pub enum Missing {
 pub struct Installation {
     /// The folder that holds `env-server` and `agent/models`.
     pub root: PathBuf,
-    /// What is there of the surroundings.
+    /// The environment of the process.
     pub host: Host,
-    /// Where Python environments are kept, unless this is a checkout.
+    /// Folder of Python environments; `None` in a checkout.
     home: Option<PathBuf>,
-    /// Holds files that were unpacked for this process alone; goes with the last clone.
+    /// Files unpacked only for this process; removed with the last clone.
     temporary: Option<Arc<TempDir>>,
 }
 
 impl Installation {
-    /// The checkout that holds the program or the current folder; without one, the embedded files. They are unpacked into
-    /// the data folder when they are first needed, or into a temporary one if nothing may be changed.
+    /// Finds the checkout that contains the program or the working directory, otherwise the
+    /// embedded files. These are unpacked into the data folder when they are first needed, or into
+    /// a temporary folder if nothing may be changed.
     pub fn find(host: &Host, bundle: &Bundle, missing: Missing) -> Result<Installation> {
         let places = [host.program.as_deref(), host.folder.as_deref()];
         let mut folders = places.into_iter().flatten().flat_map(Path::ancestors);
@@ -69,7 +71,7 @@ impl Installation {
             return Ok(Installation::checkout(root, host));
         }
         let home = home(&host.variables)
-            .context("no folder for rever's files: set REVER_HOME or HOME to an absolute path")?;
+            .context("no folder for rever's data: set REVER_HOME or HOME to an absolute path")?;
         let root = home.join(bundle.digest.get(..DIGEST_CHARACTERS).unwrap_or(bundle.digest));
         let mut found =
             Installation { root, host: host.clone(), home: Some(home), temporary: None };
@@ -87,17 +89,17 @@ impl Installation {
         Ok(found)
     }
 
-    /// A folder that is known to be a checkout.
+    /// An installation in a folder that is known to be a checkout.
     pub fn checkout(root: &Path, host: &Host) -> Installation {
         Installation { root: root.to_owned(), host: host.clone(), home: None, temporary: None }
     }
 
-    /// The checkpoint that comes with rever.
+    /// The checkpoint shipped with rever.
     pub fn policy_folder(&self) -> PathBuf {
         self.root.join("agent/models/bridge-small")
     }
 
-    /// The folder that holds the Python package `rever_env` and the lists of packages that it needs.
+    /// The folder of the Python package `rever_env` and its lists of packages.
     pub fn package_root(&self) -> PathBuf {
         self.root.join("env-server")
     }
@@ -107,13 +109,13 @@ impl Installation {
         self.home.is_none()
     }
 
-    /// Whether the files go when this process ends.
+    /// Whether the files are removed when this process ends.
     pub fn is_temporary(&self) -> bool {
         self.temporary.is_some()
     }
 
-    /// The folder of a Python environment: in a checkout `.venv/NAME`, elsewhere one for every list of packages, which
-    /// builds with the same list share.
+    /// The folder of a Python environment: `.venv/NAME` in a checkout, otherwise one folder per
+    /// list of packages, which is shared by all builds with the same list.
     pub(super) fn environment_folder(&self, name: &str, packages_digest: &str) -> PathBuf {
         let digest = packages_digest.get(..DIGEST_CHARACTERS).unwrap_or(packages_digest);
         match &self.home {
@@ -127,7 +129,7 @@ fn is_complete(folder: &Path) -> bool {
     LANDMARKS.iter().all(|file| folder.join(file).is_file())
 }
 
-/// Follows the XDG base directory specification; a relative path there is to be ignored.
+/// Follows the XDG base directory specification, which requires that relative paths are ignored.
 fn home(variables: &BTreeMap<OsString, OsString>) -> Option<PathBuf> {
     let folder = |name: &str| {
         let path = variables.get(std::ffi::OsStr::new(name)).map(PathBuf::from);
@@ -138,7 +140,8 @@ fn home(variables: &BTreeMap<OsString, OsString>) -> Option<PathBuf> {
         .or_else(|| folder("HOME").map(|home| home.join(".local/share/rever")))
 }
 
-/// Unpacks beside `root` first, so that a folder of this name is whole whenever it is seen.
+/// Unpacks into a temporary folder next to `root` and renames it, so that `root` is complete
+/// whenever it exists.
 fn unpack_once(bundle: &Bundle, root: &Path) -> Result<()> {
     let parent = root.parent().context("a folder in the data folder has a parent")?;
     let cannot = || format!("cannot unpack rever's files into {}", root.display());
@@ -147,7 +150,7 @@ fn unpack_once(bundle: &Bundle, root: &Path) -> Result<()> {
         tempfile::Builder::new().prefix(".unpacking-").tempdir_in(parent).with_context(cannot)?;
     unpack(bundle, folder.path())?;
     match std::fs::rename(folder.path(), root) {
-        // Another process was faster, with the same files.
+        // Another process has unpacked the same files first.
         Err(_) if is_complete(root) => Ok(()),
         renamed => renamed.with_context(cannot),
     }
@@ -162,7 +165,10 @@ fn unpack(bundle: &Bundle, folder: &Path) -> Result<()> {
 }
 
 fn temporary_folder() -> Result<TempDir> {
-    tempfile::Builder::new().prefix("rever-files-").tempdir().context("no temporary folder")
+    tempfile::Builder::new()
+        .prefix("rever-files-")
+        .tempdir()
+        .context("cannot create a temporary folder")
 }
 
 #[cfg(test)]
@@ -173,7 +179,7 @@ mod tests {
 
     use super::*;
 
-    /// An archive with the landmarks alone.
+    /// An archive that contains only the landmarks.
     fn bundle() -> Bundle {
         let mut archive = tar::Builder::new(GzEncoder::new(Vec::new(), Compression::fast()));
         for name in LANDMARKS {
@@ -210,11 +216,11 @@ mod tests {
         assert_eq!(again.root, found.root);
         assert!(mine.exists());
         let data = found.root.parent().unwrap();
-        assert_eq!(data.read_dir().unwrap().count(), 1, "nothing half unpacked is left");
+        assert_eq!(data.read_dir().unwrap().count(), 1, "no partly unpacked folder is left");
     }
 
     #[test]
-    fn nothing_is_left_where_nothing_may_be_changed() {
+    fn nothing_is_changed_if_missing_files_are_only_reported() {
         let folder = tempfile::tempdir().unwrap();
         let found = Installation::find(&host(folder.path()), &bundle(), Missing::Report).unwrap();
         assert!(is_complete(&found.root) && found.is_temporary());

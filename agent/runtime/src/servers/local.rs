@@ -1,4 +1,4 @@
-//! The servers that were started on this machine, as the rest of the program sees them.
+//! The servers started on this machine, as the rest of the program uses them.
 
 use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,22 +10,23 @@ use anyhow::{Context, Result};
 use super::program::ServerProgram;
 use super::supervisor::{Event, Supervisor};
 
-/// What to start.
+/// Options for local servers.
 #[derive(Debug, Clone)]
 pub struct LocalServerOptions {
-    /// How many processes.
+    /// Number of processes.
     pub count: usize,
-    /// The zenoh endpoint that they connect to; it must be listened on already.
+    /// The zenoh endpoint that the servers connect to; it must already be listening.
     pub connect: String,
-    /// The fleet that they join.
+    /// The fleet that the servers join.
     pub fleet: String,
-    /// How many sessions each process serves.
+    /// Number of sessions of each process.
     pub sessions_each: usize,
-    /// A server whose simulation does not move for so long is frozen.
+    /// Maximum time without progress of a server's simulation; after it the server counts as
+    /// frozen.
     pub silence_max: Duration,
 }
 
-/// Running servers; dropping them kills the processes.
+/// Running servers; dropping this kills the processes.
 #[derive(Debug)]
 pub struct LocalServers {
     events: Sender<Event>,
@@ -34,10 +35,12 @@ pub struct LocalServers {
 }
 
 impl LocalServers {
-    /// Starts the servers and waits until each says that it is ready. One that dies before is started again within limits;
-    /// an error when none becomes ready. Blocks the calling thread for seconds.
+    /// Starts the servers and waits until they are ready. A server that ends before is restarted a
+    /// limited number of times; it is an error if none becomes ready. Blocks the calling thread for
+    /// seconds.
     ///
-    /// `last_beat` tells when a server's simulation last moved; one whose does not is killed and started again.
+    /// `last_beat` returns when a server's simulation last made progress. A server without progress
+    /// is killed and restarted.
     pub fn start(
         program: ServerProgram,
         options: &LocalServerOptions,
@@ -55,39 +58,38 @@ impl LocalServers {
             ready,
         );
         // The kernel ties the death signal to the THREAD that started a child, not to its process.
-        // This thread lives as long as the servers do; a thread of a pool might end earlier and
-        // take them with it.
+        // This thread lives as long as the servers; a pool thread might end earlier and kill them.
         let supervisor = std::thread::Builder::new()
             .name("server supervisor".to_owned())
             .spawn(move || supervisor.run(&received))
-            .context("cannot start the thread that watches the servers")?;
+            .context("cannot start the server supervisor thread")?;
         let servers = LocalServers { events, state, supervisor: Some(supervisor) };
-        let answer = all_ready.recv().context("the thread that watches the servers ended")?;
+        let answer = all_ready.recv().context("the server supervisor thread ended")?;
         answer.map(|()| servers)
     }
 
-    /// The ids of the servers that are ready now, as they stand in the protocol's keys.
+    /// The ids of the servers that are ready, as in the protocol's keys.
     pub fn server_ids(&self) -> Vec<String> {
         lock(&self.state).server_ids.clone()
     }
 
-    /// The process ids of the servers that run now.
+    /// The process ids of the running servers.
     pub fn process_ids(&self) -> Vec<u32> {
         lock(&self.state).process_ids.clone()
     }
 
-    /// How often a server was started again.
+    /// Number of restarts of servers.
     pub fn restarts(&self) -> u32 {
         lock(&self.state).restarts
     }
 
-    /// Why no server runs any more, if none does: each died more often than it may be started again.
+    /// Why no server is running any more, if that is so: each exceeded its number of restarts.
     pub fn given_up(&self) -> Option<String> {
         lock(&self.state).given_up.clone()
     }
 
-    /// Kills a server that does not answer; another is started in its place, as when it died. Nothing happens when no server
-    /// of this id runs here.
+    /// Kills a server that does not reply and starts another one in its place. Does nothing if no
+    /// server with this id runs here.
     pub fn replace(&self, server_id: &str) {
         let _ = self.events.send(Event::Replace { server_id: server_id.to_owned() });
     }
@@ -95,7 +97,7 @@ impl LocalServers {
 
 impl Drop for LocalServers {
     fn drop(&mut self) {
-        // The supervisor may be gone already; then its children are, too.
+        // The supervisor may already have ended; then its children have ended too.
         let _ = self.events.send(Event::Stop);
         if let Some(supervisor) = self.supervisor.take() {
             let _ = supervisor.join();
@@ -103,7 +105,7 @@ impl Drop for LocalServers {
     }
 }
 
-/// What other threads may ask about, as of the last event.
+/// State for other threads, as of the last event.
 #[derive(Debug, Default)]
 pub(super) struct State {
     pub(super) server_ids: Vec<String>,
@@ -112,7 +114,7 @@ pub(super) struct State {
     pub(super) given_up: Option<String>,
 }
 
-/// A thread that panicked while it held the lock leaves plain values behind, as good as before.
+/// After a panic in another thread the values are still valid.
 pub(super) fn lock(state: &Mutex<State>) -> MutexGuard<'_, State> {
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }

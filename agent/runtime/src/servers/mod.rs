@@ -1,13 +1,13 @@
-//! Environment servers on this machine: what they need, how they are started and watched.
+//! Environment servers on this machine: dependencies, start and supervision.
 //!
 //! ```text
 //! installation  the program's own files: a checkout, or unpacked from the program
 //!   python      Python for servers ─▶ packages    system_packages   software OpenGL
 //!     wheel     the Python that rever was installed into by pip
-//!   native      the program rever-simulator       variables         what servers see of the environment
+//!   native      the program rever-simulator       variables         environment variables of servers
 //! program       a simulator that can be started
-//!   supervisor  its processes: started, watched, started again ─▶ process
-//! source        where a run's servers come from: this machine, or endpoints
+//!   supervisor  starts, watches and restarts its processes ─▶ process
+//! source        the servers of a run: local processes or endpoints
 //! ```
 
 mod installation;

@@ -1,4 +1,4 @@
-//! The native simulator: built in a checkout, found beside the program or on PATH elsewhere.
+//! The native simulator: built in a checkout, otherwise found next to the program or on PATH.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -13,11 +13,11 @@ use super::python::{PythonEnvironment, last_lines};
 use super::variables;
 
 const PROGRAM: &str = "rever-simulator";
-/// With the whole workspace, dependencies have the features that the tests build them with.
+/// Building the whole workspace selects the same features of dependencies as the tests do.
 const BUILD: [&str; 7] =
     ["build", "--release", "--workspace", "--features", "simulator/mujoco", "--bin", PROGRAM];
 
-/// The simulator with the MuJoCo of `python`.
+/// The simulator with the MuJoCo library of `python`.
 pub(super) fn prepare(
     installation: &Installation,
     python: &PythonEnvironment,
@@ -31,13 +31,13 @@ pub(super) fn prepare(
     };
     let mut variables = variables::for_server(&installation.host.variables);
     let folder = library.parent().context("a library is in a folder")?;
-    // A program that was built elsewhere looks for the library where it was then.
+    // A program built elsewhere looks for the library at its path on the build machine.
     variables.insert("LD_LIBRARY_PATH".into(), folder.into());
     let assets = installation.package_root().join("assets");
     Ok(ServerProgram::Native { program, assets, variables })
 }
 
-/// Builds the program unless it is up to date.
+/// Builds the program if it is not up to date.
 fn build(root: &Path, python: &PythonEnvironment) -> Result<PathBuf> {
     let libraries = libmujoco(root, python)?;
     let mut cargo = Command::new("cargo");
@@ -54,7 +54,7 @@ fn build(root: &Path, python: &PythonEnvironment) -> Result<PathBuf> {
     let program = messages
         .filter(|message| message["target"]["name"] == PROGRAM)
         .find_map(|message| message["executable"].as_str().map(PathBuf::from));
-    program.context("cargo built rever-simulator and did not say where")
+    program.context("cargo did not report the path of rever-simulator")
 }
 
 fn find(installation: &Installation) -> Result<PathBuf> {
@@ -69,29 +69,30 @@ fn find(installation: &Installation) -> Result<PathBuf> {
     }
     if installation.is_checkout() {
         bail!(
-            "rever-simulator is not built; any other command with --simulator native builds it, such as \
+            "rever-simulator is not built; any command that starts native servers builds it, such as \
              `rever evaluate --simulator native`"
         );
     }
     bail!(
-        "rever-simulator is neither beside rever nor on PATH: it is built in a checkout of rever, \
-         there by `rever evaluate --simulator native`; copy it from target/release beside rever"
+        "rever-simulator was found neither next to rever nor on PATH; build it in a checkout with \
+         `rever evaluate --simulator native` and copy target/release/rever-simulator next to rever"
     )
 }
 
-/// The libmujoco of this Python.
+/// The libmujoco of this Python environment.
 fn library(python: &PythonEnvironment) -> Result<PathBuf> {
     let find = "import mujoco, pathlib; \
                 print(*pathlib.Path(mujoco.__path__[0]).glob('libmujoco.so.*'), sep='\\n')";
     let output = python.command().args(["-c", find]).output();
     let output = output.with_context(|| format!("cannot start {}", python.python.display()))?;
-    let lacks = || format!("{} has no package mujoco with its library", python.python.display());
+    let lacks = || format!("{} has no mujoco package with libmujoco", python.python.display());
     ensure!(output.status.success(), "{}: {}", lacks(), last_lines(&output));
     let said = String::from_utf8_lossy(&output.stdout);
     Ok(PathBuf::from(said.lines().next().with_context(lacks)?))
 }
 
-/// A folder in a checkout with the libmujoco of this Python under the names that linker and loader look for.
+/// A folder in a checkout with links to this Python environment's libmujoco, under the names that
+/// linker and loader use.
 pub fn libmujoco(root: &Path, python: &PythonEnvironment) -> Result<PathBuf> {
     let library = library(python)?;
     let folder = root.join(".venv/libmujoco");

@@ -1,4 +1,4 @@
-//! Lists of pinned Python packages: compared with what an environment has, and installed into it.
+//! Lists of pinned Python packages: compares them with an environment and installs them.
 
 use std::fs::File;
 use std::path::Path;
@@ -14,10 +14,10 @@ use super::variables;
 
 /// The oldest Python that the locked packages support.
 const PYTHON_VERSION_MIN: (u32, u32) = (3, 10);
-/// Tried in this order; the first that is new enough is taken.
+/// Tried in this order; the first one that is new enough is used.
 const PYTHON_NAMES: [&str; 7] =
     ["python3", "python3.14", "python3.13", "python3.12", "python3.11", "python3.10", "python"];
-/// What uv may choose, or download if there is none.
+/// The versions that uv may select, or download if there is none.
 const PYTHON_VERSIONS_OF_UV: &str = ">=3.10,<3.15";
 const PIP_INSTALL: [&str; 6] =
     ["install", "--quiet", "--no-input", "--disable-pip-version-check", "--require-hashes", "-r"];
@@ -31,7 +31,8 @@ const NETWORK_WORDS: [&str; 7] = [
     "dns error",
     "error sending request",
 ];
-/// Names what differs from a list of packages. Lines with a condition are for other machines or Pythons.
+/// Prints the packages that differ from a list. Lines with a condition are for other platforms or
+/// Python versions.
 const COMPARE_PACKAGES: &str = r"
 import re, sys
 from importlib import metadata
@@ -50,7 +51,7 @@ for line in open(sys.argv[1], encoding='utf-8'):
 print(', '.join(wrong))
 ";
 
-/// A list of packages and the environment that should have them.
+/// A list of packages and its environment.
 pub(super) struct PackageList<'a> {
     pub(super) installation: &'a Installation,
     pub(super) environment: &'a PythonEnvironment,
@@ -59,10 +60,10 @@ pub(super) struct PackageList<'a> {
 }
 
 impl PackageList<'_> {
-    /// Installs them unless that was done before. A stamp for each list of packages says what is installed: the tools of the tests come and go without the servers'
-    /// packages.
+    /// Installs the packages once. A stamp file per list records that it is installed, because the
+    /// packages of the tests are installed and removed independently of those of the servers.
     ///
-    /// `try_out` is called before an installation counts as done.
+    /// `try_out` must succeed before the installation counts as done.
     pub(super) fn install_once(
         &self,
         digest: &str,
@@ -78,7 +79,7 @@ impl PackageList<'_> {
             return Ok(());
         }
         let _guard = lock_folder(self.folder)?;
-        // Another process may have done it while this one waited.
+        // Another process may have installed it in the meantime.
         if is_installed() {
             return Ok(());
         }
@@ -92,7 +93,7 @@ impl PackageList<'_> {
         Ok(())
     }
 
-    /// An error that names the packages that differ from the list, and the line that installs them.
+    /// Fails with the packages that differ from the list and the command that installs them.
     pub(super) fn compare(&self) -> Result<()> {
         let python = self.environment.python.display();
         ensure!(
@@ -113,8 +114,9 @@ impl PackageList<'_> {
         Ok(())
     }
 
-    /// With uv where it is found, which takes seconds; with venv and pip elsewhere, and where uv fails: the two are
-    /// configured apart, so that pip may know a package index that uv does not.
+    /// Installs with uv if it is available, which takes seconds. Otherwise, or if uv fails,
+    /// installs with venv and pip: these have their own configuration, so pip may know a package
+    /// index that uv does not.
     fn install(&self) -> Result<()> {
         if self.finds_uv() {
             match self.install_with_uv() {
@@ -158,10 +160,10 @@ impl PackageList<'_> {
         let python = self.find_python();
         let first = match python {
             Some(python) => attempt(python),
-            None => Err(anyhow!("no Python {major}.{minor} or newer was found")),
+            None => Err(anyhow!("found no Python {major}.{minor} or newer")),
         };
         let Err(error) = first else { return Ok(()) };
-        // A half-made folder of the first attempt is completed by the second.
+        // The second attempt completes a folder that the first one left incomplete.
         let variables = &self.installation.host.variables;
         let is_installed = install_missing(&PYTHON_PACKAGES, variables, Missing::Install)
             .with_context(|| format!("cannot create a Python environment ({error:#})"))?;
@@ -169,7 +171,7 @@ impl PackageList<'_> {
             return Err(error);
         }
         let python = self.find_python().with_context(|| {
-            format!("this system's python3 is older than {major}.{minor}: put a newer one on PATH")
+            format!("this system's python3 is older than {major}.{minor}; add a newer one to PATH")
         })?;
         attempt(python)
     }
@@ -201,7 +203,7 @@ impl PackageList<'_> {
             command.output().with_context(|| format!("cannot start {}", program.display()))?;
         ensure!(
             output.status.success(),
-            "{} ended with {}\n{}",
+            "{} failed with {}\n{}",
             program.display(),
             output.status,
             last_lines(&output)
@@ -209,7 +211,7 @@ impl PackageList<'_> {
         Ok(())
     }
 
-    /// What a user can run instead of any command that starts servers.
+    /// The command that a user can run to install the packages.
     fn line(&self) -> String {
         if self.installation.is_temporary() {
             return "rever demo --episodes 1".to_owned();
@@ -247,8 +249,8 @@ fn explain_network(error: Error) -> Error {
     )
 }
 
-/// Held until the returned file is closed, so that two programs never install into one folder at
-/// the same time.
+/// The lock is held until the returned file is closed, so that two processes never install into the
+/// same folder at the same time.
 fn lock_folder(folder: &Path) -> Result<File> {
     std::fs::create_dir_all(folder)
         .with_context(|| format!("cannot create {}", folder.display()))?;
@@ -271,7 +273,7 @@ mod tests {
     use super::super::installation::Host;
     use super::*;
 
-    /// Notes what it was asked. `venv` makes an interpreter which does the same, under its own name.
+    /// Records its arguments. `venv` creates an interpreter that does the same under its own name.
     const UV: &str = r#"#!/bin/sh
 echo uv "$@" >> "$NOTES"
 for last; do :; done
@@ -284,7 +286,7 @@ if [ "$2" = venv ]; then mkdir -p "$last/bin"; cp "$0" "$last/bin/python"; fi
 "#;
     const BROKEN: &str = "#!/bin/sh\n[ \"$1\" = --version ]\n";
 
-    /// A machine with these programs and no others.
+    /// A machine that has only these programs.
     fn machine(programs: &[(&str, &str)]) -> (TempDir, Installation) {
         let folder = tempfile::tempdir().unwrap();
         let bin = folder.path().join("bin");
@@ -305,7 +307,7 @@ if [ "$2" = venv ]; then mkdir -p "$last/bin"; cp "$0" "$last/bin/python"; fi
         (folder, installation)
     }
 
-    /// What the programs were asked when the list was installed twice, and whether it is.
+    /// Installs the list twice; returns the programs' arguments and whether the stamp exists.
     fn install(folder: &Path, installation: &Installation) -> (String, bool) {
         let venv = folder.join("venv");
         let environment = PythonEnvironment {

@@ -1,4 +1,4 @@
-//! One server process: its pipes are read, its last words kept, and it dies when this process does.
+//! One server process: reads its pipes, keeps its last output, and kills it when this process ends.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -16,13 +16,14 @@ use rustix::process::{
     Pid, Resource, Signal, WaitId, WaitIdOptions, getrlimit, kill_process_group, waitid,
 };
 
-/// How much of a server's last words an error repeats.
+/// Maximum number of stderr lines in an error.
 const STDERR_LINES_MAX: usize = 20;
-/// A longer line is cut into several.
+/// Longer lines are split.
 const LINE_BYTES_MAX: u64 = 4096;
-/// A process that has ended has written all it will; one that it started may hold its pipes open for ever.
+/// How long to wait for the output of a process that has ended. Processes that it started may keep
+/// its pipes open forever.
 const LAST_WORDS_WAIT: Duration = Duration::from_secs(1);
-/// What programs and libraries print when they get no memory.
+/// What programs and libraries print when an allocation fails.
 const MEMORY_WORDS: [&str; 5] = [
     "MemoryError",
     "bad_alloc",
@@ -38,16 +39,16 @@ pub(super) struct ServerProcess {
 }
 
 impl ServerProcess {
-    /// `on_line` receives every line of the standard output; then `on_ended` is called, once.
-    /// The process is killed when the calling thread ends.
+    /// Starts the process. `on_line` receives every line of standard output; after the last one
+    /// `on_ended` is called once. The process is killed when the calling thread ends.
     pub(super) fn spawn(
         command: &mut Command,
         on_line: impl Fn(String) + Send + 'static,
         on_ended: impl FnOnce() + Send + 'static,
     ) -> Result<ServerProcess> {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        // Ctrl-C in a terminal reaches the whole process group. The agent finishes its episodes on
-        // it, and needs the servers for that.
+        // Ctrl-C in a terminal reaches the whole process group. On Ctrl-C the agent finishes its
+        // episodes and needs the servers for that.
         command.process_group(0);
         die_with_this_thread(command);
         let program = command.get_program().to_owned();
@@ -83,20 +84,20 @@ impl ServerProcess {
         lines.iter().map(String::as_str).collect::<Vec<_>>().join("\n")
     }
 
-    /// Kills the process and those that it started. Returns at once: a process that waits for a device does not end before
-    /// the device answers.
+    /// Kills the process and its children. Does not wait: a process that waits for a device ends
+    /// only when the device replies.
     pub(super) fn kill(&mut self) {
         self.is_killed = true;
         if let Some(id) = pid(&self.child) {
-            // Only processes that have ended already cannot be killed.
+            // Fails only for processes that have already ended.
             let _ = kill_process_group(id, Signal::KILL);
         }
     }
 
-    /// Says how a process ended, after `on_ended` was called for it.
+    /// Describes how the process ended; to be called after `on_ended`.
     pub(super) fn end(mut self) -> String {
         let is_killed = self.is_killed;
-        // What it started must not outlive it. Its own number is not given to another process before it is waited for.
+        // Its children must not outlive it. Its process id is not reused before it is waited for.
         self.kill();
         let words = self.last_words();
         match self.child.wait() {
@@ -114,7 +115,7 @@ fn pid(child: &Child) -> Option<Pid> {
     i32::try_from(child.id()).ok().and_then(Pid::from_raw)
 }
 
-/// Returns when the process has ended, without removing it from the system's table, and its last words are read.
+/// Waits until the process has ended and its output is read, without reaping the process.
 fn wait_for_end(id: Pid, all_read: &Receiver<Infallible>) {
     let options = WaitIdOptions::EXITED | WaitIdOptions::NOWAIT;
     while waitid(WaitId::Pid(id), options).is_err_and(|error| error == Errno::INTR) {}
@@ -122,7 +123,8 @@ fn wait_for_end(id: Pid, all_read: &Receiver<Infallible>) {
     let _ = all_read.recv_timeout(LAST_WORDS_WAIT);
 }
 
-/// Reads to the end of the stream, without control characters: the lines go to a terminal.
+/// Reads the stream to its end and removes control characters, because the lines may be shown in a
+/// terminal.
 fn read_lines(
     stream: impl Read + Send + 'static,
     reading: Sender<Infallible>,
@@ -145,23 +147,26 @@ fn read_lines(
     });
 }
 
-/// Why a process that nobody here killed may have had too little memory.
+/// Why a process that was not killed by the supervisor may have run out of memory.
 fn memory_cause(status: ExitStatus, words: &str) -> Option<String> {
     let limit = getrlimit(Resource::As).current;
     let limited = limit.map(|bytes| {
-        format!("each process may use {} MB of memory here, see `ulimit -v`", bytes / 1_000_000)
+        format!("memory per process is limited to {} MB, see `ulimit -v`", bytes / 1_000_000)
     });
     if MEMORY_WORDS.iter().any(|cry| words.contains(cry)) {
         return Some(limited.unwrap_or_else(|| "out of memory".to_owned()));
     }
     if status.signal() == Some(Signal::KILL.as_raw()) {
-        return Some("killed from outside, perhaps for lack of memory, see `dmesg`".to_owned());
+        return Some(
+            "killed by another process, possibly by the kernel for lack of memory; see `dmesg`"
+                .to_owned(),
+        );
     }
-    // With too little for its libraries a process fails in many ways.
+    // With too little memory for its libraries a process fails in various ways.
     limited.filter(|_| !status.success())
 }
 
-/// Lets the kernel kill the child when the calling thread ends, however it ends.
+/// Makes the kernel kill the child when the calling thread ends for any reason.
 #[cfg(target_os = "linux")]
 fn die_with_this_thread(command: &mut Command) {
     use rustix::process::{getpid, getppid, set_parent_process_death_signal};
@@ -169,17 +174,17 @@ fn die_with_this_thread(command: &mut Command) {
     let parent = getpid();
     let request = move || {
         set_parent_process_death_signal(Some(Signal::KILL))?;
-        // A parent that died before the request above would never send the signal.
+        // If the parent ended before the request above, the signal would never be sent.
         if getppid() == Some(parent) {
             Ok(())
         } else {
             Err(std::io::ErrorKind::NotConnected.into())
         }
     };
-    // SAFETY: the closure allocates nothing and takes no lock, as the time after a fork demands.
+    // SAFETY: the closure does not allocate or lock, as required between fork and exec.
     unsafe { command.pre_exec(request) };
 }
 
-/// Elsewhere the server's own `--exit-with-parent` is all there is.
+/// On other systems the server's own `--exit-with-parent` must suffice.
 #[cfg(not(target_os = "linux"))]
 fn die_with_this_thread(_: &mut Command) {}

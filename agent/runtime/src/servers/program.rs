@@ -1,4 +1,4 @@
-//! The simulators whose servers can be started on this machine.
+//! The simulators that can be started on this machine.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -11,47 +11,47 @@ use serde::Serialize;
 
 use super::python::PythonEnvironment;
 
-/// One of ours. `Python` and `Native` give the same bytes.
+/// A simulator. `Python` and `Native` give the same bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Simulator {
     /// `python -m rever_env serve`.
     #[default]
     Python,
-    /// `rever-simulator`, built when it is first asked for.
+    /// `rever-simulator`, built on first use.
     Native,
-    /// The Bridge tasks in robosuite, with its controllers; it has packages of its own.
+    /// The Bridge tasks in robosuite with its controllers; it has its own Python packages.
     Robosuite,
 }
 
 impl fmt::Display for Simulator {
-    /// As the command line has it.
+    /// The name on the command line.
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let value = self.to_possible_value();
         formatter.write_str(value.as_ref().map_or("", |value| value.get_name()))
     }
 }
 
-/// A program that serves environments, ready to be started.
+/// A server program that is ready to be started.
 #[derive(Debug, Clone)]
 pub enum ServerProgram {
     /// The package `rever_env`.
     Python(PythonEnvironment),
-    /// The same, with the Bridge tasks in robosuite.
+    /// The package `rever_env` with the Bridge tasks in robosuite.
     Robosuite(PythonEnvironment),
     /// The program `rever-simulator`.
     Native {
         /// The program.
         program: PathBuf,
-        /// Scenes and tasks.toml.
+        /// Folder of the scenes and tasks.toml.
         assets: PathBuf,
-        /// All variables that it sees.
+        /// All environment variables of the process.
         variables: BTreeMap<OsString, OsString>,
     },
 }
 
 impl ServerProgram {
-    /// What its `serve` needs to be told beside the common options.
+    /// Additional arguments of its `serve` command.
     pub fn serve_arguments(&self) -> &'static [&'static str] {
         match self {
             ServerProgram::Robosuite(_) => &["--robosuite", "bridge"],
@@ -59,7 +59,7 @@ impl ServerProgram {
         }
     }
 
-    /// The program without its subcommand.
+    /// The program without a subcommand.
     pub fn command(&self) -> Command {
         match self {
             ServerProgram::Python(environment) | ServerProgram::Robosuite(environment) => {

@@ -1,4 +1,4 @@
-//! Where a run's servers come from: processes that are started on this machine, or endpoints.
+//! The servers of a run: processes started on this machine, or endpoints.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -18,48 +18,49 @@ use crate::wire::{Fleet, Network, NetworkOptions};
 
 /// Discovery timeout for servers that are already running.
 const SERVERS_WAIT: Duration = Duration::from_secs(10);
-/// A server may need nearly as long to open a session. One with episodes is found to be frozen much earlier, by the
-/// requests that it does not answer.
+/// Maximum time without progress of a local server. Opening a session may take nearly as long. A
+/// frozen server with running episodes is detected much earlier, by requests without a reply.
 const SILENCE_MAX: Duration = Duration::from_secs(60);
 
-/// Where a run's servers come from.
+/// The servers of a run.
 #[derive(Debug, Clone)]
 pub struct ServerSource {
-    /// Processes to start here; none when `connect` names others.
+    /// Processes to start on this machine; `None` if `connect` names other servers.
     pub local: Option<LocalSource>,
-    /// Endpoints of a router or of servers that are running.
+    /// Endpoints of a router or of running servers.
     pub connect: Vec<String>,
-    /// Endpoints that others may connect to, such as a trainer. Servers that are started here have one of their own.
+    /// Endpoints that other programs may connect to, such as a trainer. Local servers use another
+    /// endpoint.
     pub listen: Vec<String>,
     /// Peers see each other only within the same fleet.
     pub fleet: String,
 }
 
-/// Servers to be started on this machine.
+/// Servers to start on this machine.
 #[derive(Debug, Clone)]
 pub struct LocalSource {
-    /// How many processes.
+    /// Number of processes.
     pub count: usize,
-    /// What they are.
+    /// The simulator of the processes.
     pub simulator: Simulator,
-    /// A Python that has the packages already, instead of the one that rever sets up.
+    /// A Python with all packages installed, instead of the environment that rever installs.
     pub python: Option<PathBuf>,
     /// The program's own files.
     pub installation: Installation,
 }
 
-/// An open network, and the servers that were started for it.
+/// An open network and the servers started for it.
 pub struct Deployment {
-    /// What was asked for.
+    /// The requested servers.
     pub source: ServerSource,
-    /// The way to all servers.
+    /// The connection to all servers.
     pub network: Network,
-    /// Those of this machine.
+    /// The servers on this machine.
     pub local: Option<Arc<LocalServers>>,
 }
 
 impl Deployment {
-    /// The servers that are found in time; an error when there is none.
+    /// The servers found before the timeout; fails if there are none.
     pub async fn first_servers(&self) -> Result<Fleet> {
         let local = self.local.as_ref().map_or(0, |local| local.server_ids().len());
         let fleet = self.network.servers(local.max(1), SERVERS_WAIT).await;
@@ -81,24 +82,24 @@ impl Deployment {
         bail!(text)
     }
 
-    /// Ends the local servers, then the network. Blocks.
+    /// Ends the local servers, then closes the network. Blocks.
     pub fn close(self, runtime: &Runtime) -> Result<()> {
-        // Servers first: they would report the network's end as an error.
+        // Servers end first, otherwise they would report the closed network as an error.
         drop(self.local);
         runtime.block_on(self.network.close())
     }
 }
 
 impl ServerSource {
-    /// Opens the network and starts the local servers if there are any, each for up to `sessions` sessions. Blocks; what the
-    /// servers need is installed first, which may take minutes.
+    /// Opens the network and starts the local servers, each with up to `sessions` sessions. Blocks.
+    /// Missing dependencies of the servers are installed first, which may take minutes.
     pub fn open(&self, runtime: &Runtime, sessions: usize) -> Result<Deployment> {
         let local = self.local.as_ref();
         let program = local.map(|local| local.program(Missing::Install)).transpose()?;
         self.open_with(program, runtime, sessions)
     }
 
-    /// The same with the program of local servers, which is there.
+    /// The same with the installed program of the local servers.
     pub fn open_with(
         &self,
         program: Option<ServerProgram>,
@@ -110,12 +111,12 @@ impl ServerSource {
         Ok(Deployment { source: self.clone(), network, local: local.map(Arc::new) })
     }
 
-    /// How many servers are started here.
+    /// Number of local servers.
     pub fn local_count(&self) -> usize {
         self.local.as_ref().map_or(0, |local| local.count)
     }
 
-    /// Local servers connect to this agent; to reach others nothing needs to listen here.
+    /// Local servers connect to this agent. For other servers this agent does not listen.
     pub fn network_options(&self) -> NetworkOptions {
         NetworkOptions {
             connect: self.connect.clone(),
@@ -135,9 +136,13 @@ impl ServerSource {
     ) -> Result<LocalServers> {
         let options = LocalServerOptions {
             count: self.local_count(),
-            connect: network.listening().first().context("the network listens nowhere")?.clone(),
+            connect: network
+                .listening()
+                .first()
+                .context("the network has no listening endpoint")?
+                .clone(),
             fleet: self.fleet.clone(),
-            // Each could serve all of them, should the others die.
+            // If other servers end, each one must be able to serve all sessions.
             sessions_each: sessions,
             silence_max: SILENCE_MAX,
         };
@@ -147,7 +152,7 @@ impl ServerSource {
 }
 
 impl LocalSource {
-    /// What the servers are started with; installing it takes a minute or two.
+    /// The program of the servers. Installing it takes a minute or two.
     pub fn program(&self, missing: Missing) -> Result<ServerProgram> {
         let python = self.python_environment(missing)?;
         Ok(match self.simulator {
@@ -157,7 +162,7 @@ impl LocalSource {
         })
     }
 
-    /// The Python that the servers run on, or whose MuJoCo they use.
+    /// The Python environment of the servers, or the one whose MuJoCo they use.
     pub fn python_environment(&self, missing: Missing) -> Result<PythonEnvironment> {
         match (&self.python, self.simulator) {
             (Some(python), simulator) => {

@@ -1,4 +1,4 @@
-//! The thread that starts local servers, watches them, and starts them again; none outlives this process.
+//! The thread that starts, watches and restarts local servers. No server outlives this process.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
 use std::sync::{Arc, Mutex};
@@ -10,51 +10,52 @@ use super::local::{LocalServerOptions, State, lock};
 use super::process::ServerProcess;
 use super::program::ServerProgram;
 
-/// Starting Python, MuJoCo and OpenGL takes 1 to 2 s; the rest is for machines under load.
+/// Starting Python, MuJoCo and OpenGL takes 1 to 2 s; the rest is a margin for loaded machines.
 const READY_TIMEOUT: Duration = Duration::from_secs(120);
-/// How often one server is started again. One that keeps dying has a cause that this cannot cure.
+/// Maximum number of consecutive restarts of a server. A server that keeps ending has a cause that
+/// restarting does not fix.
 const RESTARTS_MAX: u32 = 5;
-/// The same for one that was never ready: it is waited for.
+/// The same for a server that was never ready, because the run waits for it.
 const FIRST_RESTARTS_MAX: u32 = 2;
-/// One that worked for so long did not die of that cause.
+/// After this time of normal operation the number of consecutive restarts is reset.
 const CURED_AFTER: Duration = Duration::from_secs(300);
-/// How often heartbeats are looked at.
+/// Interval of checking heartbeats.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// This process itself was stopped when a look comes so late: it has not seen the heartbeats.
+/// If a check is this late, this process itself was suspended and has missed heartbeats.
 const LATE_LOOK: Duration = Duration::from_secs(5);
-/// Killed processes end at once, unless they wait for a device.
+/// How long to wait for killed processes; they end at once unless they wait for a device.
 const END_WAIT: Duration = Duration::from_secs(5);
 
-/// When the simulation of a server last moved, if that is known.
+/// When a server's simulation last made progress, if known.
 pub(super) type LastBeat = Box<dyn Fn(&str) -> Option<Instant> + Send>;
 
 #[derive(Debug)]
 pub(super) enum Event {
-    /// A process printed that its server is ready.
+    /// The server of a process is ready.
     Ready { start: u64, server_id: String },
     /// A process ended.
     Ended { start: u64 },
-    /// A server was found not to work.
+    /// A server does not work.
     Replace { server_id: String },
     /// The servers are no longer needed.
     Stop,
 }
 
-/// One place for a server, taken by one process after the other.
+/// The slot of one server; its processes follow one another.
 #[derive(Default)]
 struct Slot {
     running: Option<Running>,
     ready: Option<Ready>,
     was_ever_ready: bool,
     restarts: u32,
-    /// Since it last worked for long.
+    /// Restarts since it last worked for a long time.
     restarts_in_a_row: u32,
-    /// Why it is not started again.
+    /// Why it is not restarted.
     given_up: Option<String>,
 }
 
 struct Running {
-    /// Tells its events from those of the processes before it.
+    /// Distinguishes this process's events from those of earlier processes.
     start: u64,
     process: ServerProcess,
     started_at: Instant,
@@ -63,26 +64,27 @@ struct Running {
 struct Ready {
     server_id: String,
     at: Instant,
-    /// When its simulation last moved.
+    /// When its simulation last made progress.
     beat_at: Instant,
 }
 
 impl Slot {
-    /// What the server does not do that it should.
+    /// What is wrong with the server, if anything.
     fn complaint(&mut self, last_beat: &LastBeat, silence_max: Duration) -> Option<String> {
         let running = self.running.as_ref()?;
         if let Some(ready) = &mut self.ready {
             let beat = last_beat(&ready.server_id);
             ready.beat_at = beat.map_or(ready.beat_at, |beat| beat.max(ready.beat_at));
             let silence = ready.beat_at.elapsed();
-            return (silence > silence_max)
-                .then(|| format!("its simulation has not moved for {} s", silence.as_secs()));
+            return (silence > silence_max).then(|| {
+                format!("its simulation has made no progress for {} s", silence.as_secs())
+            });
         }
         let is_late = running.started_at.elapsed() > READY_TIMEOUT;
         is_late.then(|| format!("it was not ready within {} s", READY_TIMEOUT.as_secs()))
     }
 
-    /// Forgives what happened while nobody looked.
+    /// Restarts the timeouts after this process was suspended.
     fn excuse(&mut self, now: Instant) {
         if let Some(running) = &mut self.running {
             running.started_at = now;
@@ -93,17 +95,17 @@ impl Slot {
     }
 }
 
-/// What the watching thread owns.
+/// The state of the supervisor thread.
 pub(super) struct Supervisor {
     program: ServerProgram,
     options: LocalServerOptions,
     slots: Vec<Slot>,
-    /// Killed, and not ended yet.
+    /// Processes that were killed and have not ended yet.
     dying: Vec<Running>,
     starts: u64,
     state: Arc<Mutex<State>>,
     events: Sender<Event>,
-    /// Answered once: when every server is ready or given up.
+    /// Receives one message when every server is ready or given up.
     ready: Option<Sender<Result<()>>>,
     last_beat: LastBeat,
     looked_at: Instant,
@@ -151,7 +153,7 @@ impl Supervisor {
         self.end(events);
     }
 
-    /// Reports whether the servers started, once that is known; false when none did.
+    /// Reports once whether the servers have started; returns false if none has.
     fn answer(&mut self, is_late: bool) -> bool {
         let is_settled = |slot: &Slot| slot.ready.is_some() || slot.given_up.is_some();
         if self.ready.is_none() || !(is_late || self.slots.iter().all(is_settled)) {
@@ -162,7 +164,7 @@ impl Supervisor {
         self.publish();
         if let Some(ready) = self.ready.take() {
             let answer = if is_any_ready { Ok(()) } else { Err(self.not_ready()) };
-            // The thread that waited for it may have ended.
+            // The receiving thread may have ended.
             let _ = ready.send(answer);
         }
         is_any_ready
@@ -179,7 +181,7 @@ impl Supervisor {
                 reasons.push(reason);
             }
         }
-        anyhow!("no server could be started: {}", reasons.join("\n"))
+        anyhow!("no environment server could be started: {}", reasons.join("\n"))
     }
 
     fn publish(&self) {
@@ -216,11 +218,11 @@ impl Supervisor {
         let is_it =
             |slot: &Slot| slot.ready.as_ref().is_some_and(|ready| ready.server_id == server_id);
         if let Some(slot) = self.slots.iter().position(is_it) {
-            self.replace(slot, "it did not answer");
+            self.replace(slot, "it did not reply");
         }
     }
 
-    /// Kills servers that are not ready in time, or whose simulation does not move.
+    /// Kills servers that are not ready in time or whose simulation makes no progress.
     fn look(&mut self) {
         let was_stopped = self.looked_at.elapsed() > LATE_LOOK;
         self.looked_at = Instant::now();
@@ -235,7 +237,8 @@ impl Supervisor {
         }
     }
 
-    /// Does not wait for the end of the process: one that waits for a device does not end before the device answers.
+    /// Does not wait for the end of the process: one that waits for a device ends only when the
+    /// device replies.
     fn replace(&mut self, slot: usize, reason: &str) {
         let Some(mut running) = self.slots[slot].running.take() else { return };
         running.process.kill();
@@ -252,12 +255,12 @@ impl Supervisor {
         let restarts_max = if slot.was_ever_ready { RESTARTS_MAX } else { FIRST_RESTARTS_MAX };
         if slot.restarts_in_a_row == restarts_max {
             let starts = restarts_max + 1;
-            let reason = format!("a server ended {starts} times, the last time: {reason}");
-            tracing::warn!("{reason}; it is not started again");
+            let reason = format!("a server ended {starts} times; last reason: {reason}");
+            tracing::warn!("{reason}; it will not be restarted");
             slot.given_up = Some(reason);
             return;
         }
-        tracing::warn!("a server ended and is started again: {reason}");
+        tracing::warn!("restarting a server: {reason}");
         slot.restarts += 1;
         slot.restarts_in_a_row += 1;
         self.start(index);
@@ -285,11 +288,11 @@ impl Supervisor {
             .args(["--sessions", &sessions.to_string()])
             .args(["--connect", &self.options.connect, "--fleet", &self.options.fleet]);
         let (lines, ended) = (self.events.clone(), self.events.clone());
-        // The supervisor may have ended when these are sent.
+        // The supervisor may have ended when these events are sent.
         ServerProcess::spawn(
             &mut command,
             move |line| {
-                // What it serves and where follows its id.
+                // The id is followed by the tasks and the endpoint of the server.
                 let offer = line.strip_prefix("ready ");
                 if let Some(server_id) = offer.and_then(|offer| offer.split_whitespace().next()) {
                     drop(lines.send(Event::Ready { start, server_id: server_id.to_owned() }));
@@ -317,10 +320,7 @@ impl Supervisor {
             }
         }
         for running in &self.dying {
-            tracing::warn!(
-                "the server process {} was killed and did not end",
-                running.process.id()
-            );
+            tracing::warn!("server process {} was killed but has not ended", running.process.id());
         }
     }
 }

@@ -1,4 +1,4 @@
-//! System packages, in Debian's and Ubuntu's names: which are missing, and how to install those.
+//! System packages with Debian's and Ubuntu's names: finds missing ones and installs them.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -12,22 +12,23 @@ use super::python::last_lines;
 
 type Variables = BTreeMap<OsString, OsString>;
 
-/// The same names on Debian 12 and 13 and on Ubuntu 22.04 and 24.04. `libopengl0` holds the entry
-/// points that MuJoCo loads, `libegl1` the off-screen context, `libgl1-mesa-dri` the software
+/// The names are the same on Debian 12 and 13 and on Ubuntu 22.04 and 24.04. `libopengl0` has the
+/// entry points that MuJoCo loads, `libegl1` the off-screen context, `libgl1-mesa-dri` the software
 /// renderer.
 pub const GL_PACKAGES: [&str; 3] = ["libegl1", "libopengl0", "libgl1-mesa-dri"];
-/// Python itself; Debian's comes without its module venv.
+/// Python itself; Debian packages its venv module separately.
 pub(super) const PYTHON_PACKAGES: [&str; 2] = ["python3", "python3-venv"];
 
-/// Installs those of the packages that this system lacks, as root with apt; whether there were any. Where that is not
-/// possible or not wanted, the error is the line to run. `variables`: the environment of the programs that are asked.
+/// Installs missing packages with apt, as root; returns whether there were any. If that is
+/// impossible or not wanted, the error contains the command to run. `variables` are the environment
+/// variables of all commands.
 pub(super) fn install_missing(
     packages: &[&str],
     variables: &Variables,
     missing: Missing,
 ) -> Result<bool> {
     let Some(lacking) = lacking(packages, variables)? else {
-        bail!("install what this system calls {}", packages.join(" "));
+        bail!("install this system's equivalents of the Debian packages {}", packages.join(" "));
     };
     if lacking.is_empty() {
         return Ok(false);
@@ -44,14 +45,14 @@ pub(super) fn install_missing(
     Ok(true)
 }
 
-/// Those that are not installed; none when this is not a system of Debian's kind.
+/// The packages that are not installed; `None` if this is not a Debian-based system.
 fn lacking<'a>(packages: &[&'a str], variables: &Variables) -> Result<Option<Vec<&'a str>>> {
     let mut lacking = Vec::new();
     for package in packages {
         let mut query = command("dpkg-query", variables);
         query.args(["--show", "--showformat", "${db:Status-Status}", package]);
         let Some(output) = run_if_found(&mut query)? else { return Ok(None) };
-        // A package that dpkg has never heard of is an error of its own.
+        // dpkg-query fails for a package that it does not know.
         if !output.status.success() || output.stdout != b"installed" {
             lacking.push(*package);
         }
@@ -75,14 +76,14 @@ fn run(command: &mut Command) -> Result<()> {
     let output = command.output().with_context(|| format!("cannot start {name}"))?;
     ensure!(
         output.status.success(),
-        "{name} ended with {}\n{}",
+        "{name} failed with {}\n{}",
         output.status,
         last_lines(&output)
     );
     Ok(())
 }
 
-/// None when there is no such program.
+/// `None` if the program does not exist.
 fn run_if_found(command: &mut Command) -> Result<Option<Output>> {
     match command.output() {
         Ok(output) => Ok(Some(output)),
@@ -91,7 +92,7 @@ fn run_if_found(command: &mut Command) -> Result<Option<Output>> {
     }
 }
 
-/// As a user would type it: its variables are nobody's business.
+/// The command as a user would type it, without its environment variables.
 fn name_of(command: &Command) -> String {
     let words = std::iter::once(command.get_program()).chain(command.get_args());
     words.map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
@@ -104,11 +105,11 @@ mod tests {
     use super::*;
 
     const APT: &str = "echo \"$@\" >> \"$NOTES\"";
-    /// One package is installed, one was removed, and of the third dpkg has never heard.
+    /// One package is installed, one was removed, and dpkg does not know the third.
     const DPKG: &str =
         "case \"$4\" in one) printf installed;; two) printf config-files;; *) exit 1;; esac";
 
-    /// What a machine with these programs answers, and what apt was asked.
+    /// The result on a machine with these programs, and the arguments of apt.
     fn install(
         programs: &[(&str, &str)],
         packages: &[&str],
@@ -130,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_missing_is_installed_and_only_by_root() {
+    fn only_missing_packages_are_installed_and_only_by_root() {
         let root = [("dpkg-query", DPKG), ("apt-get", APT), ("id", "echo 0")];
         let user = [("dpkg-query", DPKG), ("apt-get", APT), ("id", "echo 1000")];
         let (all, line) = (["one", "two", "three"], "run: sudo apt-get install -y two three");
@@ -144,6 +145,9 @@ mod tests {
         assert_eq!(install(&user, &all, Missing::Install), refused);
         assert_eq!(install(&root, &all, Missing::Report), refused);
         let (answer, _) = install(&[("id", "echo 0")], &all, Missing::Install);
-        assert_eq!(answer, Err("install what this system calls one two three".to_owned()));
+        assert_eq!(
+            answer,
+            Err("install this system's equivalents of the Debian packages one two three".to_owned())
+        );
     }
 }

@@ -1,25 +1,26 @@
-//! The environment variables that servers and installers are given.
+//! The environment variables of servers and installers.
 //!
-//! A server sees none of the user's own except those that say where things are: `CUDA_VISIBLE_DEVICES`, `PYTHONPATH`,
-//! `MUJOCO_EGL_DEVICE_ID`, Mesa's and GLVND's many and others change what it draws, imports or computes, or stop it.
+//! A server gets only those variables of the user that contain paths. Others, such as
+//! `CUDA_VISIBLE_DEVICES`, `PYTHONPATH`, `MUJOCO_EGL_DEVICE_ID` and the many variables of Mesa and
+//! GLVND, could change what the server renders, imports or computes, or stop it.
 
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
 
 type Variables = BTreeMap<OsString, OsString>;
 
-/// Where programs, files and temporary files of this user are.
+/// Paths of the user's programs, files and temporary files.
 const PASSED_ON: [&str; 5] = ["HOME", "LOGNAME", "PATH", "TMPDIR", "USER"];
 /// The same for every server on every machine.
 const FIXED: [(&str, &str); 4] = [
     ("LC_ALL", "C.UTF-8"),
-    // Images must not depend on the graphics card that this machine may have.
+    // Images must not depend on the machine's GPU.
     ("LIBGL_ALWAYS_SOFTWARE", "1"),
     ("MUJOCO_GL", "egl"),
-    // A pipe would otherwise hold lines back until a block is full, and with them the line that says "ready".
+    // Otherwise a pipe buffers the output, including the line that starts with "ready".
     ("PYTHONUNBUFFERED", "1"),
 ];
-/// Send an installation somewhere else than into its environment, or change what is installed.
+/// Variables that redirect an installation or change what is installed.
 const NOT_FOR_INSTALLERS: [&str; 10] = [
     "CONDA_PREFIX",
     "PIP_CONSTRAINT",
@@ -33,7 +34,7 @@ const NOT_FOR_INSTALLERS: [&str; 10] = [
     "VIRTUAL_ENV",
 ];
 
-/// For a server.
+/// The variables of a server.
 pub(super) fn for_server(host: &Variables) -> Variables {
     let passed_on = PASSED_ON.into_iter().filter_map(|name| {
         host.get_key_value(OsStr::new(name)).map(|(name, value)| (name.clone(), value.clone()))
@@ -41,7 +42,7 @@ pub(super) fn for_server(host: &Variables) -> Variables {
     passed_on.chain(FIXED.map(|(name, value)| (name.into(), value.into()))).collect()
 }
 
-/// For pip and uv, which need the user's proxies, package indices and certificates.
+/// The variables of pip and uv, which need the user's proxies, package indices and certificates.
 pub(super) fn for_installer(host: &Variables) -> Variables {
     let mut variables = host.clone();
     variables.retain(|name, _| {
@@ -64,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn a_server_sees_where_things_are_and_nothing_else_of_the_user() {
+    fn a_server_gets_only_paths_of_the_user() {
         let host = variables(&[
             "CUDA_VISIBLE_DEVICES",
             "DISPLAY",
@@ -84,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn an_installer_sees_the_package_index_and_no_other_target() {
+    fn an_installer_gets_the_package_index_but_no_other_target() {
         let host =
             variables(&["HTTPS_PROXY", "PIP_INDEX_URL", "PIP_TARGET", "PYTHONHOME", "VIRTUAL_ENV"]);
         assert_eq!(names(&for_installer(&host)), ["HTTPS_PROXY", "PIP_INDEX_URL"]);

@@ -1,7 +1,7 @@
-//! Event sinks: what is told of a run while it goes on, on a thread of its own.
+//! Event sinks: record and report a run on their own thread.
 //!
-//! Rollouts emit events and go on. Writing records, labels and videos blocks, and blocks this thread alone; only the
-//! episode that ended waits until its record is durable.
+//! Rollouts emit events and continue. Writing records, labels and videos blocks only this thread;
+//! only an episode that has ended waits until its record is durable.
 
 mod outcomes;
 mod progress;
@@ -22,46 +22,46 @@ pub use progress::{Counts, Progress};
 pub use store::StoreSink;
 pub use video::VideoSink;
 
-/// Events that may wait for the sinks. One with a frame holds up to 150 kB at 224 pixels.
+/// Maximum number of queued events. An event with a frame has up to 150 kB at 224 pixels.
 const WAITING_MAX: usize = 256;
 
-/// What happens in a run.
+/// An event of a run.
 #[derive(Debug, Clone)]
 pub enum Event {
     /// An episode was reset.
     Started {
         /// Its name within the run.
         id: String,
-        /// What is seen, where videos are made.
+        /// The observed image, if videos are recorded.
         image: Option<Image>,
     },
-    /// One control step is over.
+    /// One control step was executed.
     Stepped {
         /// The episode's name within the run.
         id: String,
-        /// What is seen, where videos are made.
+        /// The observed image, if videos are recorded.
         image: Option<Image>,
     },
-    /// An episode ran to its end.
+    /// An episode ended.
     Recorded(Box<EpisodeRecord>),
-    /// An attempt broke.
+    /// An attempt failed.
     Faulted(FaultRecord),
-    /// Something that a person who watches should know.
+    /// A message for the user.
     Notice(String),
 }
 
-/// Takes events, one after the other. May block.
+/// Receives all events in order. May block.
 pub trait EventSink: Send {
-    /// Takes one event. An error ends the run.
+    /// Handles one event. An error ends the run.
     fn on(&mut self, event: &Event) -> Result<()>;
 
-    /// After the last event.
+    /// Called after the last event.
     fn finish(&mut self) -> Result<()> {
         Ok(())
     }
 }
 
-/// The sinks of a run, on a thread of their own.
+/// The sinks of a run on their own thread.
 pub struct Sinks {
     events: mpsc::Sender<Message>,
     failure: Arc<Mutex<Option<String>>>,
@@ -70,7 +70,7 @@ pub struct Sinks {
 
 struct Message {
     event: Event,
-    /// Told when every sink has taken the event.
+    /// Notified when every sink has handled the event.
     taken: Option<oneshot::Sender<()>>,
 }
 
@@ -88,22 +88,22 @@ impl Sinks {
         Ok(Sinks { events, failure, thread })
     }
 
-    /// Hands an event over. The error is that of a sink which failed on this event or on one before.
+    /// Sends an event. An error is that of a sink that failed on this or an earlier event.
     pub async fn emit(&self, event: Event) -> Result<()> {
         let sent = self.events.send(Message { event, taken: None }).await;
         sent.map_err(|_| self.failed())
     }
 
-    /// Hands an episode's record over and waits until it is durable.
+    /// Sends an episode's record and waits until it is durable.
     pub async fn record(&self, record: EpisodeRecord) -> Result<()> {
-        let (taken, told) = oneshot::channel();
+        let (taken, handled) = oneshot::channel();
         let event = Event::Recorded(Box::new(record));
         let sent = self.events.send(Message { event, taken: Some(taken) }).await;
         sent.map_err(|_| self.failed())?;
-        told.await.map_err(|_| self.failed())
+        handled.await.map_err(|_| self.failed())
     }
 
-    /// Waits until every event is taken.
+    /// Waits until all events are handled.
     pub async fn finish(self) -> Result<()> {
         let Sinks { events, failure, thread } = self;
         drop(events);
@@ -116,14 +116,15 @@ impl Sinks {
         }
     }
 
-    /// Why the thread has ended.
+    /// The error that ended the thread.
     fn failed(&self) -> Error {
         let reason = lock(&self.failure).clone();
         anyhow!(reason.unwrap_or_else(|| "an event sink failed".to_owned()))
     }
 }
 
-/// Notes a failure before the channels close. A caller that finds them closed can then read the reason.
+/// Stores a failure before the channels close, so that a caller that finds them closed can read the
+/// reason.
 fn drain(
     mut sinks: Vec<Box<dyn EventSink>>,
     mut received: mpsc::Receiver<Message>,
@@ -135,7 +136,7 @@ fn drain(
             return note(error);
         }
         if let Some(taken) = taken {
-            // The episode may have been dropped meanwhile; its record is kept all the same.
+            // The episode may have been dropped in the meantime; its record is kept anyway.
             let _ = taken.send(());
         }
     }

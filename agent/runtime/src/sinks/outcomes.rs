@@ -6,7 +6,7 @@ use store::labels::outcome;
 use super::{Event, EventSink};
 use crate::wire::OutcomePublisher;
 
-/// Publishes what came of every recorded episode. An observer that cannot be reached ends no run.
+/// Publishes the outcome of every recorded episode. A failure to publish does not end the run.
 pub struct OutcomeSink {
     publisher: OutcomePublisher,
 }
@@ -23,7 +23,7 @@ impl EventSink for OutcomeSink {
         if let Event::Recorded(record) = event
             && let Err(error) = self.publisher.publish(&outcome(record))
         {
-            tracing::warn!("an outcome was not published: {error:#}");
+            tracing::warn!("{error:#}");
         }
         Ok(())
     }

@@ -1,11 +1,11 @@
-//! Keeps records, labels and faults in the run's folder.
+//! Writes records, labels and faults into the run's folder.
 
 use anyhow::Result;
 use store::run::Run;
 
 use super::{Event, EventSink};
 
-/// The one writer of a run.
+/// The only writer of a run.
 pub struct StoreSink {
     run: Run,
 }

@@ -1,4 +1,4 @@
-//! Encodes the frames of running episodes and keeps the video of those that end well.
+//! Encodes the frames of running episodes and keeps the videos of recorded ones.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -10,7 +10,8 @@ use store::video::Video;
 
 use super::{Event, EventSink};
 
-/// Writes videos into a run's folder. It comes before the store: a record that is there has its video.
+/// Writes videos into a run's folder. It must come before the store sink, so that the video of
+/// every record exists.
 pub struct VideoSink {
     folder: PathBuf,
     running: HashMap<String, Video>,

@@ -1,7 +1,8 @@
-//! Which servers a network sees: who is alive, when each simulation last moved, what each offers.
+//! Discovery of servers: which are alive, when each simulation last made progress, what each
+//! offers.
 //!
-//! zenoh's callbacks keep the status of every server; a background task asks those that are new what they offer. Nothing
-//! here is waited for by an episode.
+//! zenoh's callbacks update the status of every server, and a background task requests the
+//! descriptions of new ones. No episode waits for this.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,40 +18,41 @@ use zenoh::sample::{Sample, SampleKind};
 
 use crate::fault::printable;
 
-/// A server that does not answer a query in this time is asked again: the first query may be faster than routing.
+/// A server that does not reply to a query within this time is queried again: the first query may
+/// arrive before routes are established.
 const DESCRIBE_TIMEOUT: Duration = Duration::from_secs(2);
-/// The first pause between two queries to a server that did not describe itself, doubled each time.
+/// Initial delay before querying a server again; doubled after each failure.
 const DESCRIBE_PAUSE: Duration = Duration::from_millis(500);
-/// The longest such pause.
+/// Maximum delay.
 const DESCRIBE_PAUSE_MAX: Duration = Duration::from_secs(30);
-/// A server's memory is reported when it exceeds this, and each time that it has doubled since.
+/// A server's memory is reported when it exceeds this size, and whenever it has doubled since.
 const RESIDENT_BYTES_REPORTED: u64 = 4 << 30;
 
-/// What is known of one server at a moment.
+/// The current status of one server.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ServerStatus {
-    /// Its liveliness token stands.
+    /// Its liveliness token exists.
     pub alive: bool,
-    /// How often the token has gone: a session of before is gone with it.
+    /// How often the token has disappeared: earlier sessions ended with it.
     pub losses: u32,
-    /// When its simulation last moved.
+    /// When its simulation last made progress.
     pub beaten_at: Option<Instant>,
 }
 
 /// The servers that are alive, by their ids.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Fleet {
-    /// Those that described themselves.
+    /// The servers whose descriptions are known.
     pub servers: BTreeMap<String, Description>,
     /// Why the others cannot be used.
     pub undescribed: BTreeMap<String, String>,
 }
 
-/// Kept up to date by zenoh's callbacks and by a task in the background.
+/// The servers of a fleet, kept up to date by zenoh's callbacks and a background task.
 #[derive(Debug, Default)]
 pub struct Discovery {
     status: Mutex<HashMap<String, Known>>,
-    /// Tokens came or went; heartbeats do not count.
+    /// Tokens appeared or disappeared; heartbeats do not count.
     changed: watch::Sender<()>,
     fleet: watch::Sender<Fleet>,
 }
@@ -58,14 +60,14 @@ pub struct Discovery {
 #[derive(Debug)]
 struct Known {
     status: watch::Sender<ServerStatus>,
-    /// The next memory size that is reported.
+    /// The memory size at which the next report is due.
     resident_bytes_reported: u64,
     /// Whether an unreadable heartbeat was reported.
     is_unreadable_reported: bool,
 }
 
 impl Discovery {
-    /// Starts to watch; the session's end ends it.
+    /// Starts the discovery; it ends with the session.
     pub async fn watch(session: &Session, keys: &Keys) -> anyhow::Result<Arc<Self>> {
         let discovery = Arc::new(Self::default());
         let (watched, names) = (Arc::clone(&discovery), keys.clone());
@@ -89,17 +91,17 @@ impl Discovery {
         Ok(discovery)
     }
 
-    /// The status of one server from now on.
+    /// The status of one server, with updates.
     pub fn status(&self, server: &str) -> watch::Receiver<ServerStatus> {
         self.update(server, |_| false)
     }
 
-    /// The servers that are alive, from now on.
+    /// The servers that are alive, with updates.
     pub fn fleet(&self) -> watch::Receiver<Fleet> {
         self.fleet.subscribe()
     }
 
-    /// Asks every new server to describe itself, all at once and each again until it does.
+    /// Requests the description of every new server in parallel, each repeatedly until it replies.
     async fn ask_new_servers(self: Arc<Self>, session: Session, keys: Keys) {
         let mut changed = self.changed.subscribe();
         let mut asked = JoinSet::new();
@@ -125,7 +127,7 @@ impl Discovery {
             let again = due.unwrap_or_else(|| Instant::now() + DESCRIBE_PAUSE_MAX);
             tokio::select! {
                 Some(answer) = asked.join_next(), if !asked.is_empty() => {
-                    // A panic would be a defect of ours and is reported by its hook.
+                    // A panic is a defect of ours and is reported by the panic hook.
                     let Ok((server, answer)) = answer else { continue };
                     asking.remove(&server);
                     self.note_answer(server, answer, &mut retries);
@@ -158,7 +160,7 @@ impl Discovery {
                 self.fleet.send_if_modified(|fleet| {
                     let is_new = fleet.undescribed.get(&server) != Some(&reason);
                     if is_new {
-                        tracing::warn!("server {server} is left out: {reason}");
+                        tracing::warn!("ignoring server {server}: {reason}");
                         fleet.undescribed.insert(server, reason);
                     }
                     is_new
@@ -189,7 +191,8 @@ impl Discovery {
         let Some(server) = keys.server_of(sample.key_expr().as_str()) else { return };
         let alive = sample.kind() == SampleKind::Put;
         if !alive {
-            // First the fleet, then the status: code that reacts to the loss must not find the server in the fleet.
+            // Update the fleet before the status: code that reacts to the loss must not find the
+            // server in the fleet.
             self.forget(|name| name != server);
         }
         self.update(server, |status| {
@@ -219,7 +222,7 @@ impl Discovery {
         }
     }
 
-    /// Once per server: it comes twice a second.
+    /// Reports once per server, because heartbeats come twice a second.
     fn report_unreadable(&self, server: &str, reason: &str) {
         let mut known = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         let known = known.entry(server.to_owned()).or_default();
@@ -228,18 +231,18 @@ impl Discovery {
         }
     }
 
-    /// A simulator that leaks takes its machine down in the end; it is named before.
+    /// Reports a simulator that leaks memory before its machine runs out of memory.
     fn report_memory(&self, server: &str, resident_bytes: u64) {
         let mut known = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         let known = known.entry(server.to_owned()).or_default();
         if resident_bytes >= known.resident_bytes_reported {
             known.resident_bytes_reported = resident_bytes.saturating_mul(2);
             let gigabytes = resident_bytes as f64 / 1e9;
-            tracing::warn!("server {server} holds {gigabytes:.1} GB of memory");
+            tracing::warn!("server {server} uses {gigabytes:.1} GB of memory");
         }
     }
 
-    /// Changes a server's status; `change` says whether watchers need to look.
+    /// Changes a server's status; `change` returns whether watchers must be notified.
     fn update(
         &self,
         server: &str,
@@ -262,7 +265,7 @@ impl Default for Known {
     }
 }
 
-/// Asks one server what it is.
+/// Requests the description of one server.
 pub(super) async fn describe(
     session: Session,
     keys: Keys,
@@ -270,10 +273,10 @@ pub(super) async fn describe(
 ) -> anyhow::Result<Description> {
     let replies =
         session.get(keys.describe(&server)?).timeout(DESCRIBE_TIMEOUT).await.map_err(|error| {
-            anyhow!("cannot be asked for its description: {}", transport::in_words(error))
+            anyhow!("cannot request its description: {}", transport::in_words(error))
         })?;
     let secs = DESCRIBE_TIMEOUT.as_secs();
-    let silent = || anyhow!("did not describe itself within {secs} s");
+    let silent = || anyhow!("no description within {secs} s");
     let reply = replies.recv_async().await.map_err(|_| silent())?;
     let sample = reply.result().map_err(|_| silent())?;
     let read = || -> anyhow::Result<Description> {
@@ -283,5 +286,5 @@ pub(super) async fn describe(
         ensure!(*name == server, "expected a description of server {server}, got one of {name}");
         Ok(description)
     };
-    read().map_err(|error| anyhow!("its description cannot be read: {error:#}"))
+    read().map_err(|error| anyhow!("invalid description: {error:#}"))
 }

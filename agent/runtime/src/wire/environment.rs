@@ -1,4 +1,5 @@
-//! One leased session of a server: numbered requests, each answered once, on a wire that may lose them.
+//! A leased session of a server: numbered requests, each with one reply, over a network that may
+//! lose messages.
 
 use std::time::Duration;
 
@@ -15,10 +16,10 @@ use super::{Episode, Network, Timing};
 use crate::fault::EnvironmentFault;
 use crate::session;
 
-/// Replies that may wait to be read: one that is awaited and late copies of it. More are dropped, for
-/// the server sends again what is asked again.
+/// Maximum number of queued replies: the awaited one and late copies. More are dropped, because the
+/// server sends a reply again on request.
 const REPLIES_MAX: usize = 16;
-/// The first reset and the first step: simulators compile what these need, and do not move meanwhile.
+/// The first reset and the first step: during these, simulators compile code and make no progress.
 const FIRST_REQUESTS: u64 = 2;
 
 /// A session between episodes. Dropping it ends the session on the server.
@@ -31,15 +32,15 @@ pub struct Environment {
     has_expert: bool,
     timing: Timing,
     network: Network,
-    /// Of the last request that was sent.
+    /// Number of the last request.
     sequence: u64,
-    /// The last request as it was sent.
+    /// The encoding of the last request.
     request: ZBytes,
-    /// Times that the server's token had gone when the session was opened.
+    /// Number of losses of the server's token when the session was opened.
     losses: u32,
     status: watch::Receiver<ServerStatus>,
     replies: mpsc::Receiver<ZBytes>,
-    /// Of the last reply that was awaited.
+    /// Size of the last awaited reply.
     pub(super) reply_bytes: usize,
     publisher: Publisher<'static>,
     _subscriber: Subscriber<()>,
@@ -59,7 +60,7 @@ impl Environment {
         let (sender, replies) = mpsc::channel(REPLIES_MAX);
         let keys = &network.keys;
         let on_reply = move |sample: zenoh::sample::Sample| {
-            // A full channel holds late copies only; the reply that counts is asked for again.
+            // A full channel contains only late copies; the awaited reply is requested again.
             let _ = sender.try_send(sample.payload().clone());
         };
         let subscriber = network
@@ -112,12 +113,12 @@ impl Environment {
         &self.session
     }
 
-    /// Whether observations carry the scripted expert's action.
+    /// Whether observations include the scripted expert's action.
     pub fn has_expert(&self) -> bool {
         self.has_expert
     }
 
-    /// Starts an episode. An error gives the session up: open another one.
+    /// Starts an episode. After an error the session is lost: open another one.
     pub async fn reset(mut self, reset: Reset) -> Result<Episode, EnvironmentFault> {
         let Reset { task, variant, layout, seed } = reset;
         let request = |sequence| Request::Reset { sequence, task, variant, layout, seed };
@@ -127,7 +128,7 @@ impl Environment {
         }
     }
 
-    /// Ends the session and waits for the server's word on it.
+    /// Ends the session and waits for the server's confirmation.
     pub async fn close(mut self) -> Result<(), EnvironmentFault> {
         match self.ask("Close", |sequence| Request::Close { sequence }).await? {
             Reply::Closed { .. } => Ok(()),
@@ -145,7 +146,7 @@ impl Environment {
         )))
     }
 
-    /// Sends the next request until its reply comes; gives up when the server cannot give one.
+    /// Sends the next request, repeatedly, until its reply arrives or the server cannot give one.
     pub(super) async fn ask(
         &mut self,
         asked: &'static str,
@@ -159,8 +160,8 @@ impl Environment {
         self.ask_again(asked).await
     }
 
-    /// Empties the channel before a request goes out: what waits there are late copies of earlier replies. A reply to
-    /// the request that is about to be sent was made by somebody who had not read it.
+    /// Empties the channel before a request is sent: it may contain late copies of earlier replies.
+    /// A reply to the new request at this point would be a forgery or a defect.
     fn refuse_early_replies(&mut self, sequence: u64) -> Result<(), EnvironmentFault> {
         while let Ok(payload) = self.replies.try_recv() {
             let reply: Reply = read(&payload)?;
@@ -171,8 +172,8 @@ impl Environment {
         Ok(())
     }
 
-    /// Sends the last request once more, until its reply comes. A server that has answered it before gives the same
-    /// bytes again and does nothing else.
+    /// Sends the last request again until its reply arrives. A server that has already replied
+    /// sends the same bytes and does nothing else.
     pub(super) async fn ask_again(
         &mut self,
         asked: &'static str,
@@ -195,7 +196,8 @@ impl Environment {
         }
     }
 
-    /// The reply to the last request, or none within `wait`. Late replies to earlier ones are dropped.
+    /// The reply to the last request, or `None` within `wait`. Late replies to earlier requests are
+    /// dropped.
     async fn reply_within(
         &mut self,
         wait: Duration,
@@ -212,20 +214,22 @@ impl Environment {
                     if reply.sequence() > self.sequence {
                         return Err(early(&reply));
                     }
-                    // Number 0 is about the session itself, or about a request that could not be read.
+                    // Number 0 refers to the session itself or to a request that could not be
+                    // decoded.
                     if reply.sequence() == self.sequence || reply.sequence() == 0 {
                         self.reply_bytes = payload.len();
                         return Ok(Some(reply));
                     }
                 }
-                // An error here would mean that the network is gone; the next reply tells.
+                // An error here means that the network is closed; receiving the next reply reports
+                // it.
                 Ok(()) = self.status.changed() => self.check_server(asked, asked_at).await?,
                 () = tokio::time::sleep_until(deadline) => return Ok(None),
             }
         }
     }
 
-    /// How long the server's heartbeat may be silent now.
+    /// How long the server's heartbeat may be missing now.
     fn silence_max(&self) -> Duration {
         let Timing { silence_max, open_max, .. } = self.timing;
         if self.sequence <= FIRST_REQUESTS { silence_max.max(open_max) } else { silence_max }
@@ -241,7 +245,7 @@ impl Environment {
             self.await_return().await?;
         }
         let waited = asked_at.elapsed();
-        // Heartbeats start with the server; the first may arrive after our first request.
+        // Heartbeats start with the server; the first one may arrive after our first request.
         let silent = status.beaten_at.map_or(waited, |beaten_at| beaten_at.elapsed().min(waited));
         if silent > self.silence_max() || waited > self.timing.reply_max {
             let waited_secs = waited.as_secs();
@@ -256,8 +260,8 @@ impl Environment {
 }
 
 impl Environment {
-    /// A token that has gone may come back: the link may have failed and not the server. One that comes back within the
-    /// time for which a server keeps a session costs nothing but that time.
+    /// Waits for a lost token to reappear: the connection may have failed instead of the server. If
+    /// it reappears within the time for which a server keeps a session, the session continues.
     async fn await_return(&mut self) -> Result<(), EnvironmentFault> {
         let server = self.server.clone();
         if !self.network.is_remote() {
@@ -265,7 +269,7 @@ impl Environment {
         }
         let returned = self.status.wait_for(|status| status.alive);
         let returned = tokio::time::timeout(self.timing.link_max, returned).await;
-        // What guards the status must not be held over the next wait.
+        // The guard of the status must not be held during the next wait.
         match returned.map(|status| status.map(|status| status.losses)) {
             Ok(Ok(losses)) => {
                 self.losses = losses;
@@ -280,24 +284,24 @@ impl Environment {
     }
 }
 
-/// Reads a reply of a size that the protocol allows.
+/// Decodes a reply after checking its size.
 fn read(payload: &ZBytes) -> Result<Reply, EnvironmentFault> {
     protocol::codec::check_size::<Reply>(payload.len()).map_err(EnvironmentFault::wire)?;
     decode(&payload.to_bytes()).map_err(EnvironmentFault::wire)
 }
 
-/// For a reply to a request that was not sent yet.
+/// The fault for a reply to a request that has not been sent.
 fn early(reply: &Reply) -> EnvironmentFault {
     EnvironmentFault::wire(format!(
-        "expected request {} to come before its reply, got {} first",
+        "expected no reply to request {} before it was sent, got {}",
         reply.sequence(),
         reply.kind()
     ))
 }
 
-/// For a reply that does not belong to its request.
+/// The fault for a reply that does not match its request.
 pub(super) fn unexpected(expected: &str, reply: &Reply) -> EnvironmentFault {
-    EnvironmentFault::wire(format!("expected {expected}, got {}", reply.kind()))
+    EnvironmentFault::wire(format!("expected the reply {expected}, got {}", reply.kind()))
 }
 
 async fn ask_for_session(
@@ -323,7 +327,7 @@ async fn ask_for_session(
         _ = lost => return Err(EnvironmentFault::ServerLost { server: server.to_owned() }),
     };
     let Ok(Ok(sample)) = reply.map(zenoh::query::Reply::into_result) else {
-        // zenoh says the same whether the time is over or nobody is there.
+        // zenoh does not distinguish a timeout from a missing server.
         let waited_secs = asked_at.elapsed().as_secs();
         return Err(EnvironmentFault::TimedOut {
             server: server.to_owned(),

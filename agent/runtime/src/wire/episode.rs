@@ -1,4 +1,4 @@
-//! A running episode: only what a reset returned can step.
+//! A running episode: only the result of a reset can step.
 
 use std::mem;
 use std::time::Duration;
@@ -10,7 +10,8 @@ use super::environment::unexpected;
 use crate::fault::EnvironmentFault;
 use crate::session;
 
-/// Owns its environment until [`Episode::finish`]. After any fault but `Refused` it is void: drop it.
+/// Owns its environment until [`Episode::finish`]. After any fault except `Refused` it is void and
+/// must be dropped.
 #[derive(Debug)]
 pub struct Episode {
     environment: Environment,
@@ -27,7 +28,7 @@ impl Episode {
         Ok(Self { environment, observation, simulator_time: Duration::ZERO })
     }
 
-    /// What the policy sees now.
+    /// The current observation.
     pub fn observation(&self) -> &Observation {
         &self.observation
     }
@@ -37,7 +38,7 @@ impl Episode {
         self.environment.server()
     }
 
-    /// One control step.
+    /// Executes one control step.
     pub async fn step(&mut self, action: &[f32]) -> Result<Transition, EnvironmentFault> {
         let request = |sequence| Request::Step { sequence, action: action.to_vec() };
         match self.environment.ask("Step", request).await? {
@@ -55,22 +56,23 @@ impl Episode {
         }
     }
 
-    /// What the last step took in the simulator, as its server says: the rest of the wait for it was the wire.
+    /// The simulator's time for the last step according to its server. The rest of the waiting time
+    /// is transport.
     pub fn simulator_time(&self) -> Duration {
         self.simulator_time
     }
 
-    /// Size of the last reply, whose image may be the tiles that changed.
+    /// Size of the last reply, which may contain only the changed tiles of its image.
     pub fn reply_bytes(&self) -> usize {
         self.environment.reply_bytes
     }
 
-    /// Has the last reply sent once more; the world does not move, and nothing is written anew.
+    /// Requests the last reply again. Nothing is simulated or encoded for it.
     pub async fn repeat(&mut self) -> Result<(), EnvironmentFault> {
-        self.environment.ask_again("the last request again").await.map(drop)
+        self.environment.ask_again("a repeated request").await.map(drop)
     }
 
-    /// Keeps the present state in `slot` until the episode's end.
+    /// Saves the current state in `slot` until the end of the episode.
     pub async fn save(&mut self, slot: u32) -> Result<(), EnvironmentFault> {
         match self.environment.ask("Save", |sequence| Request::Save { sequence, slot }).await? {
             Reply::Saved { .. } => Ok(()),
@@ -78,7 +80,7 @@ impl Episode {
         }
     }
 
-    /// Goes back to the state in `slot`, bit by bit.
+    /// Restores the state in `slot`, bit by bit.
     pub async fn restore(&mut self, slot: u32) -> Result<(), EnvironmentFault> {
         match self
             .environment
@@ -90,7 +92,7 @@ impl Episode {
         }
     }
 
-    /// Ends the episode; the session can start another one.
+    /// Ends the episode and returns the session for another one.
     pub fn finish(self) -> Environment {
         self.environment
     }

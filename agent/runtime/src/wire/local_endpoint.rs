@@ -1,4 +1,4 @@
-//! An endpoint of this machine alone: a socket in a folder that only this user may open.
+//! An endpoint for this machine only: a socket in a folder that only this user can open.
 
 use std::fs::{File, Permissions};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -10,25 +10,27 @@ use rustix::fs::{FlockOperation, flock};
 use rustix::process::geteuid;
 use tempfile::TempDir;
 
-/// Stands for a free port of this machine alone.
+/// Placeholder for a free loopback port.
 pub(super) const ANY_LOOPBACK_PORT: &str = "tcp/127.0.0.1:0";
-/// Of a socket in the file system; a system's own limit is 104 or 108 with the name that zenoh adds for a lock.
+/// Maximum length of a socket path; the operating system's limit is 104 or 108 including the suffix
+/// of zenoh's lock file.
 const SOCKET_PATH_BYTES_MAX: usize = 96;
 const FOLDER_PREFIX: &str = "rever-";
 const SOCKET: &str = "zenoh";
-/// What zenoh locks while it listens at the socket.
+/// The file that zenoh locks while it listens on the socket.
 const LOCK: &str = "zenoh.lock";
-/// A younger folder may be of a process that is about to lock it.
+/// A younger folder may belong to a process that has not locked it yet.
 const AGE_MIN: Duration = Duration::from_secs(60);
 
-/// The endpoint and the folder that it is in, or a port where the folder's path does not fit into a socket's address.
+/// The endpoint and its folder, or a port if the path is too long for a socket address.
 pub(super) fn local_endpoint(parent: &Path) -> anyhow::Result<(String, Option<TempDir>)> {
     remove_stale_folders(parent, AGE_MIN);
     let mut folder = tempfile::Builder::new();
     folder.prefix(FOLDER_PREFIX).permissions(Permissions::from_mode(0o700));
-    let folder = folder.tempdir_in(parent).context("no temporary folder for a socket")?;
+    let folder =
+        folder.tempdir_in(parent).context("cannot create a temporary folder for a socket")?;
     let socket = folder.path().join(SOCKET);
-    // What begins an endpoint's parameters cannot stand in its address.
+    // These characters start an endpoint's parameters, so an address must not contain them.
     let fits = |path: &&str| path.len() <= SOCKET_PATH_BYTES_MAX && !path.contains(['?', '#', ';']);
     Ok(match socket.to_str().filter(fits) {
         Some(path) => (format!("unixsock-stream/{path}"), Some(folder)),
@@ -36,13 +38,13 @@ pub(super) fn local_endpoint(parent: &Path) -> anyhow::Result<(String, Option<Te
     })
 }
 
-/// Removes the folders of processes that were killed: nobody holds their locks.
+/// Removes the folders of killed processes, whose locks are free.
 fn remove_stale_folders(parent: &Path, age_min: Duration) {
     let Ok(entries) = parent.read_dir() else { return };
     for entry in entries.flatten() {
         let folder = entry.path();
         let is_named_so = entry.file_name().to_string_lossy().starts_with(FOLDER_PREFIX);
-        // Anybody may put a link into a folder for temporary files.
+        // Other users may create links in a shared temporary folder.
         let is_own =
             entry.metadata().is_ok_and(|data| data.is_dir() && data.uid() == geteuid().as_raw());
         if !(is_named_so && is_own) {
@@ -52,7 +54,7 @@ fn remove_stale_folders(parent: &Path, age_min: Duration) {
         let age = lock.metadata().and_then(|data| data.modified()).map(|time| time.elapsed());
         let is_old = age.is_ok_and(|age| age.is_ok_and(|age| age >= age_min));
         if is_old && flock(&lock, FlockOperation::NonBlockingLockExclusive).is_ok() {
-            // Only what was put there: a folder that holds anything else is not ours.
+            // Remove only known files: a folder with other files is not ours.
             let _ = std::fs::remove_file(folder.join(SOCKET));
             let _ = std::fs::remove_file(folder.join(LOCK));
             let _ = std::fs::remove_dir(&folder);
@@ -68,7 +70,8 @@ mod tests {
     use crate::wire::{Network, NetworkOptions};
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn the_socket_is_this_users_alone_and_goes_with_the_network() -> anyhow::Result<()> {
+    async fn only_this_user_can_open_the_socket_and_it_is_removed_with_the_network()
+    -> anyhow::Result<()> {
         let network = Network::open(NetworkOptions::default()).await?;
         let endpoint = network.listening()[0].clone();
         let socket = Path::new(endpoint.strip_prefix("unixsock-stream/").context("no socket")?);
@@ -81,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn folders_of_dead_processes_go_and_all_others_stay() -> anyhow::Result<()> {
+    fn only_folders_of_ended_processes_are_removed() -> anyhow::Result<()> {
         let parent = tempfile::tempdir()?;
         let folder = |name: &str, files: &[&str]| -> anyhow::Result<PathBuf> {
             let folder = parent.path().join(name);
@@ -109,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_with_too_long_a_name_for_a_socket_gives_a_port() -> anyhow::Result<()> {
+    fn a_path_that_is_too_long_for_a_socket_gives_a_port() -> anyhow::Result<()> {
         let folder = tempfile::tempdir()?;
         let deep = folder.path().join("d".repeat(SOCKET_PATH_BYTES_MAX));
         std::fs::create_dir(&deep)?;

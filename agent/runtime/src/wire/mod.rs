@@ -1,8 +1,9 @@
-//! The agent's end of the protocol: the only place that imports zenoh.
+//! The agent's side of the protocol; the only module that imports zenoh.
 //!
-//! [`Network`] finds servers in the background, [`ZenohPool`] opens sessions where there is room, [`Environment`] leases
-//! one and [`Episode`] is the only thing that can step it. [`OutcomePublisher`] tells observers what came of episodes,
-//! [`VerifierPublisher`] and [`VerifierSubscriber`] carry newly trained verifiers.
+//! [`Network`] discovers servers in the background, [`ZenohPool`] opens sessions on servers with
+//! free ones, [`Environment`] leases a session and only [`Episode`] can step it.
+//! [`OutcomePublisher`] publishes outcomes for observers; [`VerifierPublisher`] and
+//! [`VerifierSubscriber`] transfer newly trained verifiers.
 
 mod discovery;
 mod environment;

@@ -1,6 +1,7 @@
-//! The stream of episode outcomes, for observers: dashboards, the progress of a fleet.
+//! The stream of episode outcomes for observers, such as dashboards and the progress display of a
+//! fleet.
 //!
-//! The record and its label are written before an outcome is published, and nothing waits for anybody to read it.
+//! An outcome is published after its record and label are written. Nothing waits for a reader.
 
 use anyhow::anyhow;
 use protocol::{EpisodeOutcome, encode, transport};
@@ -17,7 +18,7 @@ pub struct OutcomePublisher {
 }
 
 impl OutcomePublisher {
-    /// For the outcomes of `run`.
+    /// A publisher for the outcomes of `run`.
     pub async fn declare(network: &Network, run: &str) -> anyhow::Result<Self> {
         let publisher = network
             .session
@@ -30,12 +31,12 @@ impl OutcomePublisher {
         Ok(Self { publisher })
     }
 
-    /// Publishes one outcome; an observer that is slow may miss it.
+    /// Publishes one outcome; a slow observer may miss it.
     pub fn publish(&self, outcome: &EpisodeOutcome) -> anyhow::Result<()> {
         let bytes = encode(outcome)?;
         self.publisher
             .put(bytes)
             .wait()
-            .map_err(|error| anyhow!("cannot publish: {}", transport::in_words(error)))
+            .map_err(|error| anyhow!("cannot publish an outcome: {}", transport::in_words(error)))
     }
 }

@@ -1,8 +1,9 @@
-//! The sessions of a run: opened where there is room, used for one episode after the other.
+//! The session pool of a run: opens sessions on servers with free ones and reuses them for
+//! consecutive episodes.
 //!
-//! Sessions are opened in the background, and an episode takes the first that is free. A server that does not answer costs
-//! the episodes that it has: it is left out for a while that grows, and until it has opened one session it is asked for
-//! one at a time.
+//! Sessions are opened in the background, and an episode takes the first free one. A server that
+//! does not reply costs only the episodes that it runs: it is skipped for an increasing time
+//! (backoff), and until it has opened one session it is asked for one at a time.
 
 use std::pin::pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -22,25 +23,26 @@ use crate::fault::EnvironmentFault;
 use crate::servers::LocalServers;
 use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 
-/// A run without any session says after this long what it waits for.
-const WAITING_TOLD: Duration = Duration::from_secs(2);
-/// Where every server that offers the task is unfit for the run, another one is waited for no longer than this.
+/// How long a run without sessions waits before it reports what it waits for.
+const REPORT_AFTER: Duration = Duration::from_secs(2);
+/// If all servers that offer the task are incompatible with the run, how long to wait for another
+/// server.
 const INCOMPATIBLE_WAIT: Duration = Duration::from_secs(2);
 
-/// What the sessions of a run have in common.
+/// Properties of all sessions of a run.
 #[derive(Debug, Clone)]
 pub struct PoolOptions {
-    /// Height and width of the images that the policy wants.
+    /// Height and width of the images that the policy expects.
     pub image_size: (usize, usize),
-    /// Numbers of the policy's actions.
+    /// Number of dimensions of the policy's actions.
     pub action_length: usize,
-    /// What sessions say of their holder.
+    /// The holder's name, for the server's log.
     pub holder: String,
-    /// The simulator of the episodes that the run has already.
+    /// The simulator of the run's existing episodes.
     pub simulator: Option<String>,
-    /// How long a run without any session waits for the first.
+    /// How long a run waits for its first session.
     pub first_wait: Duration,
-    /// How long a run that had sessions waits for one to come back.
+    /// How long a run waits for a session after it has lost all of them.
     pub wait: Duration,
 }
 
@@ -53,11 +55,11 @@ struct Pool {
     options: PoolOptions,
     fleet: watch::Receiver<Fleet>,
     state: Mutex<State>,
-    /// A session came back, or an attempt to open one ended.
+    /// A session was returned, or an attempt to open one ended.
     freed: Notify,
 }
 
-/// A server that may be asked.
+/// A server on which a session will be opened.
 struct Chosen {
     begun: Instant,
     server: String,
@@ -66,7 +68,7 @@ struct Chosen {
 }
 
 impl ZenohPool {
-    /// A pool on a network; `local` are the servers that were started here.
+    /// A pool on a network; `local` are the servers started by this process.
     pub fn new(
         network: Network,
         local: Option<Arc<LocalServers>>,
@@ -84,7 +86,7 @@ impl Pool {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// An idle session of a server that offers the task.
+    /// An idle session on a server that offers the task.
     fn idle(&self, request: &SessionRequest, fleet: &Fleet) -> Option<Session<Environment>> {
         let mut state = self.state();
         let fits = |(session, has_expert): &(Session<Environment>, bool)| {
@@ -100,7 +102,8 @@ impl Pool {
         Some(session)
     }
 
-    /// Reserves a session on the server with the fewest of this run, among those that may be asked now.
+    /// Reserves a session on the server with the fewest sessions of this run, among those that may
+    /// be asked now.
     fn reserve(&self, request: &SessionRequest, fleet: &Fleet) -> Option<Chosen> {
         let mut state = self.state();
         let now = Instant::now();
@@ -126,7 +129,8 @@ impl Pool {
         };
         state.add(&chosen.server, 1);
         state.opening.push((now, chosen.server.clone()));
-        // A session's kind is settled when it is opened: one of the other kind makes room.
+        // Whether a session includes the expert's action is fixed when it is opened: an idle
+        // session of the other kind is closed to make room.
         let is_other = |(idle, has_expert): &(Session<Environment>, bool)| {
             idle.info.server == chosen.server && *has_expert != request.needs_expert
         };
@@ -138,8 +142,9 @@ impl Pool {
         Some(chosen)
     }
 
-    /// Notes and reports servers whose simulator is not the run's, that describe the task in another way than the run's
-    /// first server, or whose task the policy cannot act in.
+    /// Finds and reports incompatible servers: their simulator is not the run's, their description
+    /// of the task differs from that of the run's first server, or the policy cannot act in their
+    /// task.
     fn check_compatible(&self, state: &mut State, task: &TaskId, fleet: &Fleet) {
         state.incompatible.retain(|server, _| fleet.servers.contains_key(server));
         for (id, server) in &fleet.servers {
@@ -148,10 +153,10 @@ impl Pool {
             let own = simulator(server);
             let reason = if got != expected {
                 format!(
-                    "task {task}: expected actions of {expected} numbers, as the policy's are, got {got}"
+                    "task {task}: expected actions with {expected} dimensions, as in the policy, got {got}"
                 )
             } else if let Some(expected) = state.simulator.as_ref().filter(|run| **run != own) {
-                format!("expected the run's simulator, {expected}, got {own}")
+                format!("expected the run's simulator ({expected}), got {own}")
             } else if let Some(difference) =
                 state.tasks.get(task).and_then(|first| difference(first, offer))
             {
@@ -160,14 +165,14 @@ impl Pool {
                 continue;
             };
             if state.incompatible.get(id) != Some(&reason) {
-                tracing::warn!("server {id} is left out: {reason}");
+                tracing::warn!("ignoring server {id}: {reason}");
                 state.incompatible.insert(id.clone(), reason);
             }
         }
     }
 
-    /// Opens a session in the background. The task does not keep the pool: its local servers end with the run, even while
-    /// another server has not answered.
+    /// Opens a session in the background. The task holds only a weak reference to the pool, so that
+    /// local servers end with the run even if another server has not replied yet.
     fn open(self: &Arc<Self>, chosen: Chosen, request: SessionRequest) {
         let open = Open {
             protocol: PROTOCOL_VERSION,
@@ -187,7 +192,7 @@ impl Pool {
         });
     }
 
-    /// Puts the opened session among the idle ones, or notes why there is none.
+    /// Adds the opened session to the idle ones, or records why there is none.
     fn note_opened(
         &self,
         chosen: Chosen,
@@ -211,7 +216,8 @@ impl Pool {
                         Session { info: SessionInfo { server, simulator, task }, environment };
                     state.idle.push((session, request.needs_expert));
                 } else {
-                    // Another server was faster; this one is reported when servers are looked at next.
+                    // Another server was faster. This one is reported at the next compatibility
+                    // check.
                     state.add(&server, -1);
                 }
             }
@@ -228,11 +234,12 @@ impl Pool {
         self.freed.notify_waiters();
     }
 
-    /// Leaves a server out for a while; one of this machine is killed and started again where it does not answer.
+    /// Skips a server for a while (backoff); a local server that does not reply is killed and
+    /// restarted.
     fn suspect(&self, state: &mut State, server: &str, fault: &EnvironmentFault) {
         let pause = state.backoff.get(server).map_or(BACKOFF, |backoff| backoff.pause * 2);
         let pause = pause.min(BACKOFF_MAX);
-        tracing::warn!("{fault}; it is left out for {} s", pause.as_secs());
+        tracing::warn!("{fault}; no new sessions on this server for {} s", pause.as_secs());
         state.pause(server, pause);
         state.proven.remove(server);
         state.idle.retain(|(session, _)| session.info.server != server);
@@ -241,7 +248,7 @@ impl Pool {
         }
     }
 
-    /// An error when nothing can come of waiting any longer.
+    /// Fails if waiting is hopeless or has taken too long.
     fn check_patience(&self, request: &SessionRequest, fleet: &Fleet) -> Result<()> {
         if let Some(reason) = self.local.as_ref().and_then(|local| local.given_up()) {
             bail!("{reason}");
@@ -249,12 +256,16 @@ impl Pool {
         let mut state = self.state();
         if state.in_use.values().sum::<usize>() > state.idle.len() + state.opening.len() {
             state.idle_since = None;
-            state.is_waiting_told = false;
+            state.is_reported = false;
             return Ok(());
         }
         let waits = *state.idle_since.get_or_insert_with(Instant::now);
-        if waits.elapsed() >= WAITING_TOLD && !std::mem::replace(&mut state.is_waiting_told, true) {
-            tracing::warn!("waiting for a session of {}: {}", request.task, state.reasons(fleet));
+        if waits.elapsed() >= REPORT_AFTER && !std::mem::replace(&mut state.is_reported, true) {
+            tracing::warn!(
+                "waiting for a session of task {}: {}",
+                request.task,
+                state.reasons(fleet)
+            );
         }
         let had_any = !state.proven.is_empty() || !state.backoff.is_empty();
         let all = fleet.servers.values();
@@ -269,7 +280,7 @@ impl Pool {
         };
         if waits.elapsed() >= patience {
             bail!(
-                "no session of {} could be opened within {} s: {}",
+                "no session of task {} could be opened within {} s: {}",
                 request.task,
                 patience.as_secs(),
                 state.reasons(fleet)
@@ -288,7 +299,7 @@ impl SessionPool for ZenohPool {
         let mut changes = pool.fleet.clone();
         loop {
             let mut freed = pin!(pool.freed.notified());
-            // From now on, whatever is freed while the pool is looked at is not missed.
+            // From now on no notification is missed while the pool is checked.
             freed.as_mut().enable();
             let fleet = changes.borrow_and_update().clone();
             if let Some(session) = pool.idle(request, &fleet) {
@@ -298,7 +309,7 @@ impl SessionPool for ZenohPool {
                 pool.open(chosen, request.clone());
             }
             pool.check_patience(request, &fleet)?;
-            // Sooner or later even where nothing changes: backoffs and patience end by the clock.
+            // Wakes up even if nothing changes: backoffs and patience end at fixed times.
             let woken = async {
                 tokio::select! {
                     () = freed => Ok(()),
@@ -321,7 +332,7 @@ impl SessionPool for ZenohPool {
         let usable = fleet.servers.keys().filter(|id| !state.incompatible.contains_key(*id));
         let fewest = usable.map(in_use).min().unwrap_or(0);
         if in_use(&server) > fewest + 1 {
-            // Another server has come (back): the next session is opened there.
+            // Another server has become available: the next session is opened there.
             state.add(&server, -1);
         } else {
             let has_expert = session.environment.has_expert();
@@ -352,7 +363,7 @@ impl SessionPool for ZenohPool {
     }
 }
 
-/// An episode that waits for a session, until it has one or waits no longer.
+/// An episode that waits for a session.
 struct Waiting<'a>(&'a Pool);
 
 impl Waiting<'_> {

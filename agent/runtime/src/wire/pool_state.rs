@@ -1,4 +1,4 @@
-//! What a pool knows of the sessions of its run and of the servers that it asks for them.
+//! The state of a pool: the sessions of its run and the servers that it asks for them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -11,52 +11,53 @@ use super::Environment;
 use super::discovery::Fleet;
 use crate::session::Session;
 
-/// A server that refused, most often because it is full, is asked again after this long.
+/// Delay before asking again a server that refused, usually because it is full.
 pub const REFUSED_PAUSE: Duration = Duration::from_secs(1);
-/// Until a server has opened one session, an opening that takes longer is no longer counted on: another server is asked, too.
+/// Until a server has opened a session, an opening that takes longer than this is not counted on:
+/// another server is asked as well.
 const OPENING_USUAL: Duration = Duration::from_secs(5);
-/// The first time for which a server that did not answer is left out, doubled each time.
+/// Initial backoff of a server that did not reply; doubled after each failure.
 pub const BACKOFF: Duration = Duration::from_secs(30);
-/// The longest such time.
+/// Maximum backoff.
 pub const BACKOFF_MAX: Duration = Duration::from_secs(600);
 
-/// What is known of a run's sessions.
+/// The sessions and servers of a run.
 #[derive(Default)]
 pub struct State {
-    /// All episodes of a run happen in one simulator of one version.
+    /// The simulator and its version; all episodes of a run use the same one.
     pub simulator: Option<String>,
-    /// Tasks as the first server that opened a session of them describes them.
+    /// The description of each task by the first server that opened a session of it.
     pub tasks: BTreeMap<TaskId, TaskDescription>,
-    /// Sessions without an episode, and whether their observations carry the expert's action.
+    /// Sessions without an episode, and whether their observations include the expert's action.
     pub idle: Vec<(Session<Environment>, bool)>,
-    /// Sessions of this run by server, those that are being opened included.
+    /// Number of this run's sessions per server, including those that are being opened.
     pub in_use: BTreeMap<String, usize>,
-    /// Those of them that are being opened: since when, and on which server.
+    /// Sessions that are being opened: start time and server.
     pub opening: Vec<(Instant, String)>,
-    /// Episodes that wait for a session.
+    /// Number of episodes that wait for a session.
     pub waiting: usize,
     /// Servers that have opened a session.
     pub proven: BTreeSet<String>,
-    /// Servers that are left out, until when.
+    /// Servers that are skipped for a while.
     pub backoff: BTreeMap<String, Backoff>,
-    /// Why a server cannot serve this run at all; reported once.
+    /// Servers that cannot serve this run, with the reasons; each is reported once.
     pub incompatible: BTreeMap<String, String>,
-    /// What servers said last when they gave no session.
+    /// The last reason of each server that gave no session.
     pub refusals: BTreeMap<String, String>,
-    /// Since when this run has had no session.
+    /// When this run last became idle, without any session in use.
     pub idle_since: Option<Instant>,
-    /// Whether it was said what it waits for.
-    pub is_waiting_told: bool,
+    /// Whether the reason for waiting was reported.
+    pub is_reported: bool,
 }
 
-/// A server that is left out for a while.
+/// A server that is skipped for a while.
 pub struct Backoff {
     pub until: Instant,
     pub pause: Duration,
 }
 
 impl State {
-    /// Whether the sessions that are being opened will do for the episodes that wait.
+    /// Whether the sessions that are being opened suffice for the waiting episodes.
     pub fn is_enough_opening(&self) -> bool {
         let is_counted_on = |(begun, server): &&(Instant, String)| {
             self.proven.contains(server) || begun.elapsed() < OPENING_USUAL
@@ -74,7 +75,7 @@ impl State {
         self.backoff.insert(server.to_owned(), backoff);
     }
 
-    /// For a server that answered, and has no room.
+    /// For a server that replied but has no free session.
     pub fn ask_later(&mut self, server: &str) {
         let until = Instant::now() + REFUSED_PAUSE;
         let backoff = self.backoff.entry(server.to_owned());
@@ -89,6 +90,10 @@ impl State {
         };
         reasons.extend(described(&self.incompatible));
         reasons.extend(described(&fleet.undescribed));
-        if reasons.is_empty() { "no server is alive".to_owned() } else { reasons.join("; ") }
+        if reasons.is_empty() {
+            "no environment server found".to_owned()
+        } else {
+            reasons.join("; ")
+        }
     }
 }

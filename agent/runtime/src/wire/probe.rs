@@ -1,4 +1,4 @@
-//! A session of a server with nothing between: any bytes out, whatever bytes come in. For those who test servers.
+//! Direct access to a session of a server: sends and receives arbitrary bytes. For server tests.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use zenoh::qos::{CongestionControl, Reliability};
 
 use super::Network;
 
-/// A leased session. Dropping it withdraws its token.
+/// A leased session. Dropping it removes its token.
 #[derive(Debug)]
 pub struct Probe {
     network: Network,
@@ -24,7 +24,7 @@ pub struct Probe {
 }
 
 impl Probe {
-    /// Asks a server for a session with any bytes.
+    /// Requests a session with arbitrary bytes.
     pub async fn ask_to_open(network: &Network, server: &str, payload: Vec<u8>) -> Result<Opening> {
         let replies = network
             .session
@@ -33,14 +33,14 @@ impl Probe {
             .timeout(network.timing.open_max)
             .await
             .map_err(in_words)?;
-        let reply = replies.recv_async().await.map_err(|_| anyhow!("no answer to Open"))?;
+        let reply = replies.recv_async().await.map_err(|_| anyhow!("no reply to Open"))?;
         let sample = reply
             .into_result()
-            .map_err(|error| anyhow!("answered {}", transport::in_words(error)))?;
+            .map_err(|error| anyhow!("error reply to Open: {}", transport::in_words(error)))?;
         Ok(decode(&sample.payload().to_bytes())?)
     }
 
-    /// Leases a session; nobody holds it until `hold` is called.
+    /// Leases a session; it has no holder until `hold` is called.
     pub async fn open(network: &Network, server: &str, open: &Open) -> Result<Probe> {
         match Probe::ask_to_open(network, server, encode(open)?).await? {
             Opening::Opened { session } => Probe::attach(network, session).await,
@@ -76,7 +76,7 @@ impl Probe {
         Ok(())
     }
 
-    /// Withdraws the holder's token, as a holder that died does.
+    /// Removes the holder's token, as if the holder had ended.
     pub async fn let_go(&mut self) -> Result<()> {
         match self.token.take() {
             Some(token) => token.undeclare().await.map_err(in_words),
@@ -84,24 +84,24 @@ impl Probe {
         }
     }
 
-    /// Sends any bytes as a request.
+    /// Sends arbitrary bytes as a request.
     pub async fn send(&self, bytes: &[u8]) -> Result<()> {
         self.publisher.put(bytes).await.map_err(in_words)
     }
 
-    /// The next reply's bytes, or none within `wait`.
+    /// The bytes of the next reply, or `None` within `wait`.
     pub async fn receive(&mut self, wait: Duration) -> Option<Vec<u8>> {
         timeout(wait, self.replies.recv()).await.ok().flatten()
     }
 }
 
 impl Network {
-    /// Asks one server what it is.
+    /// Requests the description of one server.
     pub async fn describe(&self, server: &str) -> Result<Description> {
         super::discovery::describe(self.session.clone(), self.keys.clone(), server.to_owned()).await
     }
 
-    /// The heartbeats that a server sends within `wait`.
+    /// The heartbeats received from a server within `wait`.
     pub async fn heartbeats(&self, server: &str, wait: Duration) -> Result<Vec<Heartbeat>> {
         let subscriber = self
             .session
@@ -113,7 +113,7 @@ impl Network {
         let mut beats = Vec::new();
         while let Ok(Ok(sample)) = timeout_at(deadline, subscriber.recv_async()).await {
             let beat = decode(&sample.payload().to_bytes());
-            beats.push(beat.context("a heartbeat cannot be read")?);
+            beats.push(beat.context("invalid heartbeat")?);
         }
         Ok(beats)
     }

@@ -1,4 +1,5 @@
-//! Newly trained verifiers on their way to agents: the last one of a name is kept for late comers.
+//! Publishes newly trained verifiers to agents. zenoh keeps the last one of each name for later
+//! subscribers.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -31,7 +32,8 @@ pub struct VerifierSubscriber {
 }
 
 impl VerifierPublisher {
-    /// For the verifier `name`. Keep it: what it published last is asked of it.
+    /// A publisher of the verifier `name`. It must stay alive, because it serves its last update to
+    /// later subscribers.
     pub async fn declare(network: &Network, name: &str) -> anyhow::Result<Self> {
         let publisher = network
             .session
@@ -47,16 +49,17 @@ impl VerifierPublisher {
         Ok(Self { name: name.to_owned(), publisher })
     }
 
-    /// Waits until at least one agent follows this verifier, or until `wait` is over; whether one does.
+    /// Waits up to `wait` until at least one agent has subscribed to this verifier; returns whether
+    /// one has.
     pub async fn wait_for_follower(&self, wait: Duration) -> anyhow::Result<bool> {
         let failed = |error| {
             anyhow!(
-                "cannot watch who follows verifier {}: {}",
+                "cannot detect subscribers of verifier {}: {}",
                 self.name,
                 transport::in_words(error)
             )
         };
-        // The listener comes first: who arrives between the two is seen by one of them.
+        // The listener is created first, so that no subscriber is missed between the two calls.
         let listener = self.publisher.matching_listener().await.map_err(failed)?;
         if self.publisher.matching_status().await.map_err(failed)?.matching() {
             return Ok(true);
@@ -72,7 +75,7 @@ impl VerifierPublisher {
         Ok(tokio::time::timeout(wait, arrival).await.unwrap_or(false))
     }
 
-    /// Publishes `weights` as the newest version, for agents with the policy of digest `policy`.
+    /// Publishes `weights` as the newest version, for agents whose policy has the digest `policy`.
     pub async fn publish(&self, policy: &str, weights: Vec<u8>) -> anyhow::Result<()> {
         let digest = digest_of(&weights);
         let update = VerifierUpdate {
@@ -89,7 +92,7 @@ impl VerifierPublisher {
 }
 
 impl VerifierSubscriber {
-    /// Versions of the verifier `name`, the last one of before included.
+    /// Subscribes to the verifier `name`; also receives its last earlier version.
     pub async fn declare(network: &Network, name: &str) -> anyhow::Result<Self> {
         let (sender, latest) = watch::channel(None);
         let subscriber = network
@@ -104,7 +107,7 @@ impl VerifierSubscriber {
         Ok(Self { latest, _subscriber: subscriber })
     }
 
-    /// A receiver of the latest version: look between episodes, never inside one.
+    /// A receiver of the latest version. Use it between episodes, never during one.
     pub fn latest(&self) -> watch::Receiver<Option<Arc<VerifierUpdate>>> {
         self.latest.clone()
     }
@@ -113,7 +116,7 @@ impl VerifierSubscriber {
 fn receive(sender: &watch::Sender<Option<Arc<VerifierUpdate>>>, sample: &Sample) {
     match read(sample) {
         Ok(update) => drop(sender.send_replace(Some(Arc::new(update)))),
-        Err(error) => tracing::warn!(%error, "a verifier update was refused"),
+        Err(error) => tracing::warn!(%error, "ignored an invalid verifier update"),
     }
 }
 
@@ -123,7 +126,7 @@ fn read(sample: &Sample) -> anyhow::Result<VerifierUpdate> {
     let digest = digest_of(&update.weights);
     anyhow::ensure!(
         update.digest == digest,
-        "expected weights of digest {}, got {digest}",
+        "expected weights with digest {}, got {digest}",
         update.digest
     );
     Ok(update)

@@ -1,4 +1,5 @@
-//! The queue of one run folder: every planned episode without a record, in the memory of the one process that runs them.
+//! The queue of one run folder: all planned episodes without a record, in the memory of the process
+//! that runs them.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -14,7 +15,7 @@ use super::{
 use crate::plan::EpisodePlan;
 use crate::record::EpisodeIdentity;
 
-/// Planned episodes minus recorded ones. Leases do not expire: they are held by this process alone.
+/// Planned minus recorded episodes. Leases do not expire, because only this process holds them.
 #[derive(Debug)]
 pub struct RunQueue {
     state: Mutex<State>,
@@ -33,15 +34,16 @@ struct State {
 struct Entry {
     identity: EpisodeIdentity,
     setting: Setting,
-    /// Faults of the episode itself.
+    /// Number of the episode's own faults.
     attempts: u32,
-    /// Faults of servers and links.
+    /// Number of faults of servers and links.
     interruptions: u32,
     reasons: Vec<String>,
 }
 
 impl RunQueue {
-    /// Every episode with every setting, episode by episode, so that a partial run is paired; without what is recorded.
+    /// Every episode with every setting, ordered by episode so that a partial run is paired,
+    /// without recorded ones.
     pub fn new(
         run: &str,
         plans: &[EpisodePlan],
@@ -64,7 +66,7 @@ impl RunQueue {
         RunQueue { state: Mutex::new(state) }
     }
 
-    /// A panic elsewhere leaves the queue as it was before or after one of its steps.
+    /// A panic elsewhere cannot leave the queue in the middle of a step.
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -73,7 +75,7 @@ impl RunQueue {
 impl State {
     fn take_back(&mut self, lease: &Lease) -> Result<Entry> {
         self.leased.remove(&lease.token).with_context(|| {
-            format!("episode {}: expected a lease that is held", lease.job.identity.id())
+            format!("episode {}: this worker no longer holds its lease", lease.job.identity.id())
         })
     }
 }
@@ -188,7 +190,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn settings_of_an_episode_follow_each_other_and_recorded_ones_are_left_out() {
+    async fn episodes_are_ordered_by_number_and_recorded_ones_are_skipped() {
         let all = complete_all(&queue(&[])).await;
         assert_eq!(all.len(), 8);
         assert_eq!(all[0], "a-default-0000-greedy-n1-t0");
@@ -205,7 +207,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_episode_that_breaks_is_run_again_last_and_given_up_with_its_reasons() {
+    async fn a_failed_episode_is_requeued_last_and_given_up_with_its_reasons() {
         let queue = queue(&[]);
         let first = next(&queue).await;
         let id = first.job.identity.id();
@@ -251,7 +253,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_released_episode_is_the_next_one_and_a_lease_holds_once() {
+    async fn a_released_episode_is_next_and_a_lease_is_valid_once() {
         let queue = queue(&[]);
         let lease = next(&queue).await;
         let (id, token) = (lease.job.identity.id(), lease.token);
@@ -262,7 +264,10 @@ mod tests {
         let old = Lease { job: lease.job.clone(), token };
         assert!(!queue.renew(&old).await.expect("an answer"));
         let error = queue.complete(old).await.expect_err("of an earlier lease");
-        assert_eq!(error.to_string(), format!("episode {id}: expected a lease that is held"));
+        assert_eq!(
+            error.to_string(),
+            format!("episode {id}: this worker no longer holds its lease")
+        );
         queue.complete(lease).await.expect("held");
     }
 }

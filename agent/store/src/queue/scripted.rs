@@ -1,4 +1,4 @@
-//! A queue that follows a script and notes every call, for the tests of what runs episodes.
+//! A scripted queue that records all calls, for the tests of crates that run episodes.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -8,20 +8,20 @@ use async_trait::async_trait;
 
 use super::{Disposition, EpisodeQueue, FaultScope, GivenUp, Job, Lease, QueueProgress};
 
-/// One call that a [`ScriptedQueue`] was asked, with the id of its episode.
+/// A call of a [`ScriptedQueue`], with the id of its episode.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum QueueEvent {
-    /// Given to a worker.
+    /// Leased to a worker.
     Leased(String),
-    /// Ran to its end.
+    /// Ended.
     Completed(String),
-    /// Broke.
+    /// Failed.
     Failed(String, FaultScope, String),
-    /// Could not be begun.
+    /// Could not be started.
     Released(String),
 }
 
-/// Gives out its jobs once, each in turn; an episode that breaks is given up at once.
+/// Leases each job once, in order; an episode that fails is given up at once.
 #[derive(Debug, Default)]
 pub struct ScriptedQueue {
     state: Mutex<State>,
@@ -46,17 +46,17 @@ impl ScriptedQueue {
         ScriptedQueue { state: Mutex::new(state) }
     }
 
-    /// Says from now on that another worker holds the lease of this episode.
+    /// From now on another worker holds the lease of this episode.
     pub fn lose(&self, id: &str) {
         self.state().lost.insert(id.to_owned());
     }
 
-    /// Answers every call from now on with this error; none ends that.
+    /// From now on every call fails with this error; `None` ends that.
     pub fn break_with(&self, error: Option<&str>) {
         self.state().error = error.map(str::to_owned);
     }
 
-    /// All calls so far that changed something.
+    /// All calls so far that changed the queue.
     pub fn events(&self) -> Vec<QueueEvent> {
         self.state().events.clone()
     }
@@ -76,7 +76,7 @@ impl ScriptedQueue {
     fn take_back(&self, lease: &Lease) -> Result<(MutexGuard<'_, State>, String)> {
         let (mut state, id) = (self.answer()?, lease.job.identity.id());
         if !state.leased.remove(&lease.token) || state.lost.contains(&id) {
-            bail!("episode {id}: expected a lease that is held");
+            bail!("episode {id}: this worker no longer holds its lease");
         }
         Ok((state, id))
     }

@@ -1,4 +1,4 @@
-//! A record's file: the record, how it came about, and a checksum over both.
+//! The file of a record: the record, its provenance, and a checksum of both.
 
 use std::path::{Path, PathBuf};
 
@@ -11,48 +11,48 @@ use super::{EpisodeRecord, RECORD_VERSION};
 use crate::durable::write_whole;
 use crate::provenance::Provenance;
 
-/// Versions before records had a checksum.
+/// Versions of the format without a checksum.
 const VERSIONS_WITHOUT_CHECKSUM: std::ops::RangeInclusive<u32> = 1..=3;
 
-/// What one file holds.
+/// The content of a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordFile {
-    /// How the record came about.
+    /// The provenance of the record.
     pub provenance: Provenance,
-    /// What happened.
+    /// The record.
     pub record: EpisodeRecord,
 }
 
-/// Why a record cannot be read.
+/// Why a record could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    /// The system refuses; the record may be whole.
+    /// An I/O error; the record may be intact.
     #[error("cannot read the record {path}")]
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The operating system's error.
         source: std::io::Error,
     },
-    /// Whole, and written by a build with another format.
+    /// Intact, but written in another version of the format.
     #[error("{path}: expected record version {RECORD_VERSION}, got {found}")]
     OtherVersion {
         /// The file.
         path: PathBuf,
-        /// Its version, or in what it differs.
+        /// The version of the file, or how its fields differ.
         found: String,
     },
-    /// Not what was written.
-    #[error("{path}: damaged: {reason}; rerun the command of its run to run the episode again")]
+    /// The file's content has changed since it was written.
+    #[error("{path}: damaged: {reason}; rerun the command of its run to repeat the episode")]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What was expected and what came.
+        /// What was expected and what was found.
         reason: String,
     },
 }
 
-/// The file's own form. Both parts are MessagePack themselves, so that the checksum is over bytes.
+/// The file's layout. Both parts are MessagePack themselves, so that the checksum covers bytes.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Envelope<'a> {
@@ -65,14 +65,14 @@ struct Envelope<'a> {
     record: &'a Bytes,
 }
 
-/// What files of all versions have.
+/// The field that files of all versions have.
 #[derive(Deserialize)]
 struct Versioned {
     version: u32,
 }
 
 impl EpisodeRecord {
-    /// Writes the record so that after any interruption the file is whole or absent.
+    /// Writes the record atomically: after any interruption the file is complete or absent.
     pub fn write(&self, path: &Path, provenance: &Provenance) -> Result<()> {
         let record = rmp_serde::to_vec_named(self).context("cannot encode the record")?;
         let provenance =
@@ -88,14 +88,14 @@ impl EpisodeRecord {
         write_whole(path, &bytes)
     }
 
-    /// Reads a record and checks every byte of its file.
+    /// Reads a record and verifies its checksum.
     pub fn read(path: &Path) -> Result<EpisodeRecord, ReadError> {
         Ok(RecordFile::read(path)?.record)
     }
 }
 
 impl RecordFile {
-    /// Reads a file and checks every byte of it.
+    /// Reads a file and verifies its checksum.
     pub fn read(path: &Path) -> Result<RecordFile, ReadError> {
         let bytes = std::fs::read(path)
             .map_err(|source| ReadError::Unreadable { path: path.to_owned(), source })?;
@@ -114,18 +114,19 @@ impl RecordFile {
                 });
             }
         };
-        // Bytes after the envelope, and other spellings of the same envelope, are not in the checksum.
+        // The checksum does not cover bytes after the envelope and alternative encodings of the
+        // envelope.
         if rmp_serde::to_vec_named(&envelope).ok().as_deref() != Some(bytes) {
-            return Err(damaged("expected one record and nothing else".to_owned()));
+            return Err(damaged("expected exactly one record".to_owned()));
         }
         let Envelope { version, sha256, provenance, record } = envelope;
         if checksum(version, provenance, record) != **sha256 {
-            return Err(damaged("its checksum is another one".to_owned()));
+            return Err(damaged("its checksum does not match".to_owned()));
         }
         if version != RECORD_VERSION {
             return Err(other(version.to_string()));
         }
-        // What was written by a build that has other fields is no damage.
+        // A build with other fields is not damage.
         let differs = |error| other(format!("{version} with other fields: {error}"));
         let provenance = rmp_serde::from_slice(provenance).map_err(differs)?;
         let record: EpisodeRecord = rmp_serde::from_slice(record).map_err(differs)?;
@@ -133,7 +134,7 @@ impl RecordFile {
     }
 }
 
-/// The version of a file that is whole but has another form; none for one that is damaged.
+/// The version of an intact file in another format; `None` for a damaged file.
 fn version(mut bytes: &[u8]) -> Option<u32> {
     let Versioned { version } = rmp_serde::from_read(&mut bytes).ok()?;
     let is_other = VERSIONS_WITHOUT_CHECKSUM.contains(&version) || version > RECORD_VERSION;
@@ -179,13 +180,13 @@ mod tests {
     }
 
     #[test]
-    fn a_record_is_read_back_whole_with_its_provenance() {
+    fn a_record_is_read_back_with_its_provenance() {
         let file = decode(&bytes_of(&made_up(3))).expect("whole");
         assert_eq!(file, RecordFile { provenance: provenance(), record: made_up(3) });
     }
 
     #[test]
-    fn a_flipped_bit_anywhere_is_found() {
+    fn any_flipped_bit_is_detected() {
         let bytes = bytes_of(&made_up(0));
         for index in 0..bytes.len() {
             for bit in 0..8 {
@@ -198,15 +199,14 @@ mod tests {
     }
 
     #[test]
-    fn a_record_that_ends_early_or_late_is_damaged() {
+    fn a_record_with_missing_or_extra_bytes_is_damaged() {
         let bytes = bytes_of(&made_up(0));
         for length in 0..bytes.len() {
             let error = decode(&bytes[..length]).expect_err("it ends early");
             assert!(matches!(error, ReadError::Damaged { .. }), "{length} bytes: {error}");
         }
         let error = decode(&[&bytes[..], &[0]].concat()).expect_err("one byte more");
-        let expected =
-            "a.msgpack: damaged: expected one record and nothing else; rerun the command";
+        let expected = "a.msgpack: damaged: expected exactly one record; rerun the command";
         assert!(error.to_string().starts_with(expected), "{error}");
     }
 
@@ -219,7 +219,7 @@ mod tests {
         };
         let later = EpisodeRecord { version: 5, ..made_up(0) };
         check(&bytes_of(&later), "expected record version 4, got 5");
-        // Of the first versions, which had no checksum, and of one to come.
+        // Versions without a checksum, and a future one.
         for version in [1, 2, 3, 6] {
             let other = json!({"version": version, "steps": [{"log_probability": -3.5}]});
             let bytes = rmp_serde::to_vec_named(&other).expect("bytes");

@@ -1,4 +1,4 @@
-//! The faults of a run: one line of JSON per attempt that broke.
+//! The faults of a run: one line of JSON per failed attempt.
 
 use std::fs::OpenOptions;
 use std::io::Write;
@@ -12,24 +12,24 @@ use crate::record::EpisodeIdentity;
 
 pub(super) const FAULTS: &str = "faults.jsonl";
 
-/// One attempt that broke. It is never a label.
+/// A failed attempt. It is never a label.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FaultRecord {
-    /// The episode that was to be run.
+    /// The episode of the attempt.
     pub identity: EpisodeIdentity,
     /// 1 for the first attempt of this process.
     pub attempt: u32,
-    /// The server it broke on.
+    /// The server on which it failed.
     pub server: String,
-    /// What broke.
+    /// What the fault affects.
     pub scope: FaultScope,
     /// What happened.
     pub reason: String,
 }
 
-/// All attempts of a run that broke. Lines that cannot be read are left out with a warning: nothing is derived from faults but
-/// their number. A line that a killed process left unfinished is no fault.
+/// All failed attempts of a run. Unreadable lines are ignored with a warning, because only the
+/// number of faults is used. A line that a killed process left incomplete is not a fault.
 pub fn faults(folder: &Path) -> Result<Vec<FaultRecord>> {
     let path = folder.join(FAULTS);
     if !path.exists() {
@@ -46,12 +46,15 @@ pub fn faults(folder: &Path) -> Result<Vec<FaultRecord>> {
         }
     }
     if let Some(first) = unreadable.first() {
-        tracing::warn!("{name}: {} unreadable lines are not counted; {first}", unreadable.len());
+        tracing::warn!(
+            "{name}: ignored {} unreadable lines, the first is {first}",
+            unreadable.len()
+        );
     }
     Ok(faults)
 }
 
-/// Appends a fault and makes it durable.
+/// Appends a fault and syncs the file.
 pub(super) fn append(folder: &Path, fault: &FaultRecord) -> Result<()> {
     let path = folder.join(FAULTS);
     let mut line = serde_json::to_vec(fault)?;
@@ -64,7 +67,7 @@ pub(super) fn append(folder: &Path, fault: &FaultRecord) -> Result<()> {
     write().with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Cuts off a line that a killed process left unfinished, so that the next one begins on its own.
+/// Removes an incomplete last line of a killed process, so that the next line starts correctly.
 pub(super) fn cut_unfinished(folder: &Path) -> Result<()> {
     let path = folder.join(FAULTS);
     if !path.exists() {

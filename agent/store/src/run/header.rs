@@ -1,4 +1,5 @@
-//! What a run was asked for, by which builds it was made, and what a second start may add to it.
+//! The header of a run: its options, its builds, and which of them may change when the run is
+//! resumed.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -17,26 +18,26 @@ const HEADER: &str = "run.json";
 /// Version of the file; a header of another version is refused.
 const HEADER_VERSION: u32 = 2;
 
-/// What an episode's course does not depend on: a run may grow by it.
+/// Options that do not affect the course of an episode: they may grow when a run is resumed.
 const GROWING: [&str; 2] = ["settings", "episodes"];
 
 /// The file `run.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunHeader {
-    /// The version of this file's form.
+    /// Version of the file's format.
     pub version: u32,
-    /// The run's name everywhere: in records, labels and zenoh keys.
+    /// The run's name in records, labels and zenoh keys.
     pub run: String,
-    /// Everything that decides the results, by name.
+    /// Everything that determines the results, by name.
     pub options: Value,
-    /// Versions at the start, by name.
+    /// Versions when the run was started, by name.
     pub versions: Value,
-    /// The different command lines and builds that the run was started with, first to last.
+    /// The distinct command lines and builds that started or resumed the run, in order.
     pub starts: Vec<RunStart>,
 }
 
-/// A start that differs from those before it.
+/// A start or resumption that differs from all earlier ones.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunStart {
@@ -49,7 +50,8 @@ pub struct RunStart {
 }
 
 impl RunHeader {
-    /// Says which other builds made a part of the run; none where all had the sources of `build`.
+    /// Names the other builds that contributed to the run; `None` if all had the sources of
+    /// `build`.
     pub fn other_builds(&self, build: &Build) -> Option<String> {
         let mut others: Vec<String> = Vec::new();
         for start in self.starts.iter().filter(|start| !start.build.has_sources_of(build)) {
@@ -61,7 +63,7 @@ impl RunHeader {
         let run = &self.run;
         (!others.is_empty()).then(|| {
             format!(
-                "the run {run} holds episodes of another build: {}; this is {build}",
+                "the run {run} contains episodes of other builds: {}; this build is {build}",
                 others.join(", ")
             )
         })
@@ -73,7 +75,7 @@ pub fn read_header(folder: &Path) -> Result<RunHeader> {
     let path = folder.join(HEADER);
     let text = std::fs::read_to_string(&path)
         .with_context(|| format!("{} is not a run: cannot read {HEADER}", folder.display()))?;
-    let what = || format!("{} is not a run's header", path.display());
+    let what = || format!("{} is not the header of a run", path.display());
     let header: Value = serde_json::from_str(&text).with_context(what)?;
     ensure!(
         header["version"] == json!(HEADER_VERSION),
@@ -84,7 +86,7 @@ pub fn read_header(folder: &Path) -> Result<RunHeader> {
     serde_json::from_value(header).with_context(what)
 }
 
-/// Writes the header of a new run, or checks that of the one in `folder` and notes what is added to it.
+/// Writes the header of a new run, or checks the existing header in `folder` and adds to it.
 pub fn settle(request: &RunRequest, has_records: bool) -> Result<RunHeader> {
     let RunRequest { folder, options, versions, command, build, .. } = request;
     let name = folder.display();
@@ -94,11 +96,14 @@ pub fn settle(request: &RunRequest, has_records: bool) -> Result<RunHeader> {
             ensure_same("option", &header.options, options)?;
             ensure_same("version", &header.versions, versions)
         };
-        check().with_context(|| format!("the run {name} exists"))?;
+        check().with_context(|| format!("cannot resume the run {name}"))?;
         header
     } else {
-        // The records name their run, but only the header says what else may be mixed with them.
-        ensure!(!has_records, "the run {name} has records but no {HEADER}; choose another --out");
+        // Records name their run, but only the header has the options that they were run with.
+        ensure!(
+            !has_records,
+            "the run {name} has records but no {HEADER}; choose another folder (--out)"
+        );
         RunHeader {
             version: HEADER_VERSION,
             run: unique_name(folder),
@@ -122,7 +127,7 @@ pub fn settle(request: &RunRequest, has_records: bool) -> Result<RunHeader> {
     Ok(header)
 }
 
-/// Adds the settings and episodes that are asked for and not noted yet; whether there were any.
+/// Adds requested settings and episodes that are not in the header yet; true if there were any.
 fn grow(noted: &mut Value, asked: &Value) -> bool {
     let mut grown = false;
     if let (Some(noted), Some(asked)) =
@@ -142,7 +147,8 @@ fn grow(noted: &mut Value, asked: &Value) -> bool {
     grown
 }
 
-/// The folder's name and eight random digits: runs of the same name in different places must not share labels.
+/// The folder's name and eight random digits, so that runs with the same folder name have different
+/// labels.
 fn unique_name(folder: &Path) -> String {
     let name =
         folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
@@ -152,7 +158,7 @@ fn unique_name(folder: &Path) -> String {
     format!("{name}-{:08x}", rand::random::<u32>())
 }
 
-/// Names the first thing that differs: mixing two sets of options in one table would be worse than stopping.
+/// Reports the first difference. Results of different options must not be mixed in one table.
 fn ensure_same(what: &str, existing: &Value, asked: &Value) -> Result<()> {
     let (Value::Object(existing), Value::Object(asked)) = (existing, asked) else {
         bail!("{what}s: expected names and values, got {existing} and {asked}");
@@ -163,7 +169,7 @@ fn ensure_same(what: &str, existing: &Value, asked: &Value) -> Result<()> {
             (existing.get(name).unwrap_or(&Value::Null), asked.get(name).unwrap_or(&Value::Null));
         ensure!(
             was == is,
-            "{what} {name}: it was started with {was}, got {is}; choose another --out for another run"
+            "{what} {name}: started with {was}, got {is}; choose another folder (--out) for a new run"
         );
     }
     Ok(())
@@ -191,20 +197,16 @@ mod tests {
             let error = settled(folder.path(), options, versions).expect_err(expected);
             assert!(format!("{error:#}").contains(expected), "{error:#}");
         };
-        check(
-            options(2, &["greedy"], 24),
-            policy("cafe"),
-            "option seed: it was started with 1, got 2",
-        );
+        check(options(2, &["greedy"], 24), policy("cafe"), "option seed: started with 1, got 2");
         check(
             json!({"settings": ["greedy"], "episodes": 24}),
             policy("cafe"),
-            "option seed: it was started with 1, got null",
+            "option seed: started with 1, got null",
         );
         check(
             options(1, &["greedy"], 24),
             policy("beef"),
-            "version policy: it was started with \"cafe\", got \"beef\"",
+            "version policy: started with \"cafe\", got \"beef\"",
         );
     }
 
@@ -223,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn every_command_and_build_of_a_run_is_noted_once_and_another_build_is_said() {
+    fn every_command_and_build_of_a_run_is_recorded_once_and_other_builds_are_reported() {
         let folder = tempfile::tempdir().expect("a folder");
         let start = |build: &Build, episodes: &str| {
             let command = ["rever", "evaluate", "--episodes", episodes].map(str::to_owned).to_vec();
@@ -250,8 +252,8 @@ mod tests {
         assert_eq!(
             header.other_builds(&other).expect("said"),
             format!(
-                "the run {} holds episodes of another build: rever 1.2.3 (commit cafe, built Monday), \
-                 rever 1.2.3 (commit cafe, built Tuesday); this is rever 1.2.3 (commit beef-dirty, built Friday)",
+                "the run {} contains episodes of other builds: rever 1.2.3 (commit cafe, built Monday), \
+                 rever 1.2.3 (commit cafe, built Tuesday); this build is rever 1.2.3 (commit beef-dirty, built Friday)",
                 header.run
             )
         );

@@ -1,7 +1,8 @@
-//! The index of a run: a summary of every record, in SQLite, so that tables need not read the records.
+//! The index of a run: a summary of every record in SQLite, so that tables need not read the
+//! records.
 //!
-//! Only the holder of the run's lock makes or changes it; whoever else reads it opens it read-only and reads the records
-//! themselves where it does not help.
+//! Only the holder of the run's lock creates or changes the index. Other processes open it
+//! read-only and read the records themselves if the index is unusable.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -17,15 +18,15 @@ use crate::labels::WAIT;
 
 /// The index's file in the run's folder.
 pub(super) const INDEX: &str = "index.sqlite";
-/// Rises when the table changes; an index of another version is not used.
+/// Increases when the schema changes; an index of another version is not used.
 const INDEX_VERSION: i64 = 3;
-/// How long a reader waits for a transaction before it reads the records.
+/// How long a reader waits for a transaction before it reads the records instead.
 const READER_WAIT: Duration = Duration::from_secs(2);
 
-/// Makes an empty index in place of the one that is there; only for the holder of the run's lock.
+/// Creates an empty index in place of an existing one. Only the holder of the run's lock may do so.
 pub(super) fn create(folder: &Path) -> Result<Connection> {
     let path = folder.join(INDEX);
-    // The journal of a killed process belongs to the index that goes.
+    // The journal of a killed process belongs to the old index.
     for name in [INDEX.to_owned(), format!("{INDEX}-journal")] {
         let old = folder.join(name);
         if old.exists() {
@@ -42,10 +43,10 @@ pub(super) fn create(folder: &Path) -> Result<Connection> {
         index.pragma_update(None, "user_version", INDEX_VERSION)?;
         Ok(index)
     };
-    create().with_context(|| format!("cannot make {}", path.display()))
+    create().with_context(|| format!("cannot create {}", path.display()))
 }
 
-/// Puts a summary in, in place of the episode's earlier one.
+/// Inserts a summary, replacing an earlier one of the episode.
 pub(super) fn insert(index: &Connection, summary: &EpisodeSummary) -> Result<()> {
     let text = serde_json::to_string(summary)?;
     let sha256 = hex(&Sha256::digest(&text));
@@ -55,7 +56,7 @@ pub(super) fn insert(index: &Connection, summary: &EpisodeSummary) -> Result<()>
     Ok(())
 }
 
-/// All summaries by the episodes' names, from an index that another process may be writing; changes nothing.
+/// All summaries by episode name, from an index that another process may be writing. Read-only.
 pub(super) fn read(folder: &Path) -> Result<BTreeMap<String, EpisodeSummary>> {
     let index = Connection::open_with_flags(folder.join(INDEX), OpenFlags::SQLITE_OPEN_READ_ONLY)?;
     index.busy_timeout(READER_WAIT)?;
@@ -64,18 +65,18 @@ pub(super) fn read(folder: &Path) -> Result<BTreeMap<String, EpisodeSummary>> {
     summaries(&index)
 }
 
-/// All summaries by the episodes' names.
+/// All summaries by episode name.
 pub(super) fn summaries(index: &Connection) -> Result<BTreeMap<String, EpisodeSummary>> {
     let mut statement = index.prepare("SELECT id, summary, sha256 FROM episodes")?;
     let rows = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?, row.get(2)?)))?;
     let mut summaries = BTreeMap::new();
     for row in rows {
         let (id, text, sha256): (String, String, String) = row?;
-        // SQLite sees damage to its own structure, not to what it holds.
+        // SQLite detects damage of its own structure, but not of the stored values.
         ensure!(hex(&Sha256::digest(&text)) == sha256, "the row of {id} is damaged");
         let summary: EpisodeSummary =
             serde_json::from_str(&text).with_context(|| format!("the row of {id}"))?;
-        ensure!(summary.identity.id() == id, "the row of {id} is another episode's");
+        ensure!(summary.identity.id() == id, "the row of {id} contains another episode");
         summaries.insert(id, summary);
     }
     Ok(summaries)

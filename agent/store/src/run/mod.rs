@@ -1,16 +1,18 @@
 //! A run is a folder: its options and versions, one record per finished episode, an index, a lock.
 //!
 //! ```text
-//! run.json            what was asked for, by which commands and builds; a second start may only ask for more of the same
-//! episodes/{id}.msgpack   the truth: one whole file per finished episode, with a checksum
-//! episodes/{id}.msgpack.damaged   a record that was set aside; its episode is run again
-//! index.sqlite        a summary of every record; made anew at every start
-//! faults.jsonl        one line per attempt that broke; never a label
-//! videos/{id}.mp4     when asked for
+//! run.json            options, commands and builds; resuming may only add settings and episodes
+//! episodes/{id}.msgpack   the source of truth: one complete file per finished episode, with a
+//! checksum
+//! episodes/{id}.msgpack.damaged   a damaged record that was set aside; its episode is run again
+//! index.sqlite        a summary of every record; recreated whenever the run is opened
+//! faults.jsonl        one line per failed attempt; never a label
+//! videos/{id}.mp4     if requested
 //! lock                held by the one process that writes
 //! ```
 //!
-//! [`Run`] is the writer. All functions beside it read, change nothing, and may be called while another process writes.
+//! [`Run`] is the writer. The functions beside it are read-only and may be called while another
+//! process writes.
 
 mod faults;
 mod header;
@@ -31,8 +33,8 @@ pub use writer::{Run, RunRequest};
 
 use crate::record::ReadError;
 
-/// All recorded episodes of a run that another process may be writing, ordered by name. Damaged records are left out with a
-/// warning.
+/// All recorded episodes of a run, ordered by name; another process may be writing. Damaged records
+/// are ignored with a warning.
 pub fn summaries(folder: &Path) -> Result<Vec<EpisodeSummary>> {
     let ids = recorded(folder)?;
     let mut indexed = index::read(folder).unwrap_or_else(|error| {
@@ -46,11 +48,11 @@ pub fn summaries(folder: &Path) -> Result<Vec<EpisodeSummary>> {
             Ok(entry) => {
                 indexed.insert(id.clone(), entry.summary);
             }
-            // Its writer has set it aside meanwhile.
+            // The writer has set it aside in the meantime.
             Err(ReadError::Unreadable { source, .. })
                 if source.kind() == std::io::ErrorKind::NotFound => {}
             Err(error @ ReadError::Damaged { .. }) => {
-                tracing::warn!("a record is not counted: {error}")
+                tracing::warn!("ignored a record: {error}")
             }
             Err(error) => return Err(error.into()),
         }

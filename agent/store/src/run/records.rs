@@ -1,4 +1,4 @@
-//! The records in a run's folder: where they are, which there are, and what becomes of damaged ones.
+//! The records in a run's folder: their paths, their names, and the handling of damaged ones.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -14,14 +14,14 @@ use crate::record::{EpisodeRecord, ReadError};
 pub(super) const EPISODES: &str = "episodes";
 pub(super) const VIDEOS: &str = "videos";
 const RECORD_SUFFIX: &str = ".msgpack";
-/// Follows the name of a record that was set aside.
+/// Suffix of a record that was set aside.
 const DAMAGED_SUFFIX: &str = ".damaged";
 
-/// What index and label store keep of a record.
+/// The data of a record in the index and the label store.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Entry {
     pub summary: EpisodeSummary,
-    /// None where the episode has no outcome: the policy never acted.
+    /// `None` if the episode has no outcome because the policy never acted.
     pub label: Option<Label>,
 }
 
@@ -33,38 +33,39 @@ impl Entry {
         }
     }
 
-    /// Reads a record and checks that it is the episode of its name.
+    /// Reads a record and checks that its content matches its file name.
     pub fn read(folder: &Path, id: &str) -> Result<Entry, ReadError> {
         let path = record_path(folder, id);
         let record = EpisodeRecord::read(&path)?;
         let named = record.identity.id();
         if named != id {
-            let reason = format!("expected the episode of its name, got {named}");
+            let reason = format!("expected the episode in its file name, got {named}");
             return Err(ReadError::Damaged { path, reason });
         }
         Ok(Entry::new(&record, &path))
     }
 }
 
-/// Where the record of an episode is.
+/// Path of an episode's record.
 pub fn record_path(folder: &Path, id: &str) -> PathBuf {
     folder.join(EPISODES).join(format!("{id}{RECORD_SUFFIX}"))
 }
 
-/// Where the video of an episode is, if there is one.
+/// Path of an episode's video, if there is one.
 pub fn video_path(folder: &Path, id: &str) -> PathBuf {
     folder.join(VIDEOS).join(format!("{id}.mp4"))
 }
 
-/// Keeps the video of an episode. It is written before the record, so that every record's video exists.
+/// Writes the video of an episode. It is written before the record, so that a record's video always
+/// exists.
 pub fn write_video(folder: &Path, id: &str, video: &[u8]) -> Result<()> {
     let videos = folder.join(VIDEOS);
     std::fs::create_dir_all(&videos)
-        .with_context(|| format!("cannot make {}", videos.display()))?;
+        .with_context(|| format!("cannot create {}", videos.display()))?;
     write_whole(&video_path(folder, id), video)
 }
 
-/// The names of all recorded episodes: what the folder holds, whatever the index says.
+/// The names of all recorded episodes according to the folder, independent of the index.
 pub fn recorded(folder: &Path) -> Result<BTreeSet<String>> {
     let episodes = folder.join(EPISODES);
     let read = || -> std::io::Result<BTreeSet<String>> {
@@ -80,7 +81,7 @@ pub fn recorded(folder: &Path) -> Result<BTreeSet<String>> {
     read().with_context(|| format!("cannot read {}", episodes.display()))
 }
 
-/// Reads and checks the records of these episodes, in their order, on all processors.
+/// Reads and checks the records of these episodes in parallel; returns them in the same order.
 pub(super) fn read_all(folder: &Path, ids: &[String]) -> Vec<Result<Entry, ReadError>> {
     let threads = thread::available_parallelism().map_or(1, usize::from);
     let part = ids.len().div_ceil(threads).max(1);
@@ -94,7 +95,8 @@ pub(super) fn read_all(folder: &Path, ids: &[String]) -> Vec<Result<Entry, ReadE
     })
 }
 
-/// Reads all records of the run `run` for its writer. A damaged one is set aside, so that its episode is run again.
+/// Reads all records of the run `run` for its writer. A damaged record is set aside, so that its
+/// episode is run again.
 pub(super) fn check_all(folder: &Path, run: &str) -> Result<Vec<Entry>> {
     let ids: Vec<String> = recorded(folder)?.into_iter().collect();
     let mut entries = Vec::with_capacity(ids.len());
@@ -118,14 +120,14 @@ pub(super) fn check_all(folder: &Path, run: &str) -> Result<Vec<Entry>> {
         std::fs::rename(&path, &aside)
             .with_context(|| format!("cannot rename {}", path.display()))?;
         tracing::warn!(
-            "{id}: its record is set aside as {} and the episode is run again: {reason}",
+            "{id}: renamed its damaged record to {}; the episode is run again: {reason}",
             aside.display()
         );
     }
     Ok(entries)
 }
 
-/// Removes what a killed process was writing.
+/// Removes the incomplete files of a killed process.
 pub(super) fn remove_unfinished(folder: &Path) -> Result<()> {
     let folders = [folder.to_path_buf(), folder.join(EPISODES), folder.join(VIDEOS)];
     for folder in folders.iter().filter(|folder| folder.exists()) {

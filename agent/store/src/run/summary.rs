@@ -1,4 +1,4 @@
-//! What tables need of a record.
+//! The part of a record that tables use.
 
 use protocol::Statistics;
 use serde::{Deserialize, Serialize};
@@ -11,27 +11,27 @@ use crate::record::{DecisionRecord, EpisodeIdentity, EpisodeRecord};
 pub struct EpisodeSummary {
     /// Which episode.
     pub identity: EpisodeIdentity,
-    /// As of the last step.
+    /// The statistics at the last step.
     pub statistics: Statistics,
     /// The simulator and its version.
     pub simulator: String,
-    /// Control steps.
+    /// Number of control steps.
     pub steps: u32,
-    /// Decisions without a well-formed candidate.
+    /// Number of decisions without a well-formed candidate.
     pub held_steps: u32,
-    /// Malformed candidates of all decisions.
+    /// Number of malformed candidates.
     pub malformed: u32,
-    /// Candidates of all decisions.
+    /// Number of candidates.
     pub candidates: u32,
     /// Seconds from the reset to the last step.
     pub wall_secs: f32,
-    /// Of each decision: its share of its batch's time.
+    /// For each decision: its share of its batch's time.
     pub decision_ms: Vec<f32>,
-    /// Of each decision: how many were made together with it, itself included.
+    /// For each decision: the number of decisions in its batch, including itself.
     pub batch_size: Vec<u32>,
-    /// Of each step.
+    /// For each step: time from the action to the next observation.
     pub step_ms: Vec<f32>,
-    /// Of each step.
+    /// For each step: the server's part of that time.
     pub simulator_ms: Vec<f32>,
 }
 

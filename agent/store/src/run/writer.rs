@@ -15,16 +15,16 @@ use crate::labels::{self, LabelStore};
 use crate::provenance::{Build, Provenance};
 use crate::record::EpisodeRecord;
 
-/// What a run is asked for.
+/// The request to start or resume a run.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RunRequest {
-    /// Where it is kept.
+    /// Folder of the run.
     pub folder: PathBuf,
-    /// The label store that it feeds; none for a run that is thrown away.
+    /// The label store that receives the run's labels; `None` for a temporary run.
     pub labels: Option<PathBuf>,
-    /// Everything that decides the results, by name.
+    /// Everything that determines the results, by name.
     pub options: Value,
-    /// Versions of everything that the results depend on, by name.
+    /// Versions of everything that affects the results, by name.
     pub versions: Value,
     /// The command line, word by word.
     pub command: Vec<String>,
@@ -32,33 +32,35 @@ pub struct RunRequest {
     pub build: Build,
 }
 
-/// A run that this process may write. Every call blocks on the disk, so callers make them on a thread of their own.
+/// A run that this process may write. Every call blocks on the disk, so it belongs on its own
+/// thread.
 #[derive(Debug)]
 pub struct Run {
-    /// Where it is kept, from the root.
+    /// Absolute path of the folder.
     pub folder: PathBuf,
-    /// What it is.
+    /// The header of the run.
     pub header: RunHeader,
-    /// What every record of this process says of itself.
+    /// The provenance of all records of this process.
     provenance: Provenance,
-    /// The index, with the label store attached to it.
+    /// The index, with the label store attached.
     connection: Connection,
     labels: Option<PathBuf>,
-    /// Recorded episodes that index and label store lack.
+    /// Recorded episodes that are missing in the index and the label store.
     incomplete: RefCell<BTreeSet<String>>,
     _lock: Lock,
 }
 
 impl Run {
-    /// Starts a run, or resumes the one in the folder when it has the same options and versions; more settings and more
-    /// episodes are added to it. Afterwards index and label store say what the records say.
+    /// Starts a run, or resumes the one in the folder if it has the same options and versions;
+    /// additional settings and episodes are added to it. Afterwards the index and the label store
+    /// agree with the records.
     pub fn open(request: &RunRequest) -> Result<Run> {
         let name = request.folder.display();
         std::fs::create_dir_all(request.folder.join(EPISODES))
-            .with_context(|| format!("cannot make the run {name}"))?;
-        // Labels name records; they must be found from any working folder.
+            .with_context(|| format!("cannot create the run {name}"))?;
+        // Labels contain paths of records, which must be valid from any working folder.
         let folder = std::path::absolute(&request.folder)
-            .with_context(|| format!("cannot find the folder {name}"))?;
+            .with_context(|| format!("cannot resolve the folder {name}"))?;
         ensure!(folder.to_str().is_some(), "the run {name}: expected a path in UTF-8");
         let lock = lock(&folder)?;
         let header = header::settle(request, !records::recorded(&folder)?.is_empty())?;
@@ -83,8 +85,9 @@ impl Run {
         Ok(run)
     }
 
-    /// Makes an episode durable: its record first, then its summary and its label in one transaction. Where only the second
-    /// fails, nothing is lost; it is said and tried again in [`Run::complete`] and at the next start.
+    /// Makes an episode durable: first its record, then its summary and its label in one
+    /// transaction. If only the transaction fails, nothing is lost: a warning is logged and the
+    /// transaction is retried in [`Run::complete`] and when the run is resumed.
     pub fn record(&self, record: &EpisodeRecord) -> Result<()> {
         let (id, run) = (record.identity.id(), &self.header.run);
         ensure!(
@@ -97,14 +100,16 @@ impl Run {
         match self.index(&[Entry::new(record, &path)]) {
             Ok(()) => self.incomplete.borrow_mut().remove(&id),
             Err(error) => {
-                tracing::warn!("{id} is recorded, but its label is not written yet: {error:#}");
+                tracing::warn!(
+                    "{id} is recorded, but its label could not be written yet: {error:#}"
+                );
                 self.incomplete.borrow_mut().insert(id)
             }
         };
         Ok(())
     }
 
-    /// Notes an attempt that broke.
+    /// Records a failed attempt.
     pub fn fault(&self, fault: &FaultRecord) -> Result<()> {
         faults::append(&self.folder, fault)
     }
@@ -114,7 +119,8 @@ impl Run {
         super::summaries(&self.folder)
     }
 
-    /// Writes the labels that could not be written before. What is missing when this fails is completed at the next start.
+    /// Writes the labels that could not be written before. If this fails, they are written when the
+    /// run is resumed.
     pub fn complete(&self) -> Result<()> {
         let ids = Vec::from_iter(self.incomplete.borrow().iter().cloned());
         if ids.is_empty() {
@@ -127,7 +133,7 @@ impl Run {
         complete().with_context(|| {
             let (count, run) = (ids.len(), &self.header.run);
             format!(
-                "{count} recorded episodes of the run {run} have no label; rerun the same command"
+                "{count} recorded episodes of the run {run} have no label yet; rerun the same command to write them"
             )
         })?;
         self.incomplete.borrow_mut().clear();
@@ -137,7 +143,7 @@ impl Run {
     fn attach_labels(&self) -> Result<()> {
         let Some(path) = &self.labels else { return Ok(()) };
         let name = path.display();
-        // Made, and checked for being one, by itself.
+        // Opening it separately creates it and checks that it is a label store.
         LabelStore::open(path)?;
         let text = path.to_str().with_context(|| format!("{name}: expected a path in UTF-8"))?;
         self.connection
@@ -146,7 +152,7 @@ impl Run {
         Ok(())
     }
 
-    /// Makes index and label store say what the records say, in one transaction.
+    /// Makes the index and the label store agree with the records, in one transaction.
     fn reconcile(&self) -> Result<()> {
         let entries = records::check_all(&self.folder, &self.header.run)?;
         let transaction = self.begin()?;
@@ -159,8 +165,8 @@ impl Run {
                 labels::reconcile(&self.connection, &self.header.run, &self.folder, &expected)?;
             if changed + removed > 0 {
                 tracing::warn!(
-                    "label store {}: {changed} labels of the run {} said something else than their records and were \
-                     corrected, {removed} had no record and were removed",
+                    "label store {}: corrected {changed} labels of the run {} that differed from their \
+                     records, removed {removed} labels without a record",
                     path.display(),
                     self.header.run
                 );
@@ -169,7 +175,7 @@ impl Run {
         transaction.commit().context("cannot write the index and the label store")
     }
 
-    /// Puts episodes into index and label store, all or none.
+    /// Adds episodes to the index and the label store, all or none.
     fn index(&self, entries: &[Entry]) -> Result<()> {
         let transaction = self.begin()?;
         for entry in entries {
@@ -181,7 +187,7 @@ impl Run {
         transaction.commit().with_context(|| self.databases())
     }
 
-    /// A transaction over all files that has their locks from its start, so that it cannot fail for one halfway.
+    /// A transaction over both files that locks both at its start, so that it cannot fail halfway.
     fn begin(&self) -> Result<rusqlite::Transaction<'_>> {
         let behavior = rusqlite::TransactionBehavior::Immediate;
         rusqlite::Transaction::new_unchecked(&self.connection, behavior)
@@ -195,13 +201,14 @@ impl Run {
     }
 }
 
-/// Released by the system when the process ends, however it ends.
+/// The operating system releases the lock when the process ends.
 #[derive(Debug)]
 struct Lock(File);
 
 impl Drop for Lock {
-    /// A child that is being started holds a copy of every file until it runs its own program: closing ours would
-    /// leave the run locked for that long, unlocking releases it at once.
+    /// A child process that is being started has a copy of every open file until it executes its
+    /// own program. Closing our file would leave the run locked until then; unlocking releases it
+    /// at once.
     fn drop(&mut self) {
         let _ = self.0.unlock();
     }

@@ -1,7 +1,8 @@
-//! What each decision of an episode changed: the advantage of the executed action, by TD(lambda).
+//! The advantage of each executed action by TD(lambda).
 //!
-//! The outcome alone is a poor label for one of sixty actions. A critic that knows the situation before and after tells
-//! earlier what an action did. Its values are cross-fitted: no outcome of an episode's own fold shapes its values.
+//! The outcome alone is a noisy label for one of sixty actions. A critic that values the situations
+//! before and after an action attributes changes to it. The values are cross-fitted: the critic of
+//! an episode was fitted without the outcomes of its fold.
 
 use anyhow::Result;
 use candle_nn::optim::{AdamW, Optimizer, ParamsAdamW};
@@ -16,25 +17,25 @@ use super::set::TrainingEpisode;
 use super::{pass, split};
 use crate::{Network, Standardisation};
 
-/// The critic is smaller than the verifier: it must not remember episodes.
+/// The critic is smaller than the verifier, so that it does not memorise episodes.
 const HIDDEN_SIZES: [usize; 2] = [64, 32];
-/// Passes over the decisions; more begin to overfit.
+/// Passes over the decisions; more passes overfit.
 const EPOCHS: usize = 4;
 const BATCH_SAMPLES: usize = 256;
 const LEARNING_RATE: f64 = 3e-4;
 const WEIGHT_DECAY: f64 = 0.1;
 
-/// An episode whose decisions were between several candidates.
+/// An episode whose decisions had several candidates.
 pub struct RankingEpisode<'a> {
     /// The episode.
     pub episode: &'a TrainingEpisode,
-    /// Its decisions, one for each sample.
+    /// One decision per sample.
     pub decisions: &'a [DecisionSample],
-    /// The part of the episodes that it belongs to.
+    /// The fold of the episode.
     pub fold: usize,
 }
 
-/// The episodes with decisions, dealt to folds by their layouts.
+/// The episodes with decisions, assigned to folds by their layouts.
 pub fn ranking_episodes<'a>(
     episodes: impl Iterator<Item = &'a TrainingEpisode>,
     folds: usize,
@@ -50,9 +51,11 @@ pub fn ranking_episodes<'a>(
     episodes
 }
 
-/// The advantage of every executed action, as changes of the probability of success, from the values of the situations.
+/// The advantage of every executed action as a change of the success probability, computed from the
+/// values of the situations.
 ///
-/// delta_t = V(t + 1) - V(t), the last one with the outcome in place of V; A_t = delta_t + decay A_(t + 1).
+/// delta_t = V(t + 1) - V(t), where the outcome replaces the last V(t + 1);
+/// A_t = delta_t + decay A_(t + 1).
 pub fn advantages(values: &[f64], is_success: bool, decay: f64) -> Vec<f64> {
     let mut next_value = f64::from(u8::from(is_success));
     let mut later = 0.0;
@@ -69,14 +72,15 @@ pub fn advantages(values: &[f64], is_success: bool, decay: f64) -> Vec<f64> {
     advantages
 }
 
-/// Values situations; knows more than the verifier may, and is thrown away after training.
+/// Estimates the values of situations. It uses simulator state that the verifier must not use, and
+/// is discarded after training.
 pub struct Critic {
     network: Network,
     tasks: Vec<TaskId>,
 }
 
 impl Critic {
-    /// A critic of situations like those of `all`, fitted to the episodes in use.
+    /// Fits a critic to the used episodes; `all` determines the tasks it distinguishes.
     pub fn fit(
         all: &[RankingEpisode<'_>],
         is_used: impl Fn(&RankingEpisode<'_>) -> bool,
@@ -92,7 +96,7 @@ impl Critic {
         let rows = || inputs.iter().map(Vec::as_slice);
         let size = inputs.first().map_or(0, Vec::len);
         let standardisation = Standardisation::of(size, rows());
-        // Values are probabilities, so both classes weigh the same.
+        // Values are probabilities, so both classes have the same weight.
         let samples = Samples::new(&standardisation, rows(), &labels, 0.5)?;
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let learner = Learner::new(size, HIDDEN_SIZES, &mut random)?;
@@ -107,7 +111,7 @@ impl Critic {
         Ok(Critic { network: learner.network(&standardisation)?, tasks })
     }
 
-    /// The probability of success before each decision of an episode.
+    /// The success probability before each decision of an episode.
     pub fn values(&self, episode: &RankingEpisode<'_>) -> Vec<f64> {
         let inputs = inputs(episode, &self.tasks);
         let value = |row| 1.0 / (1.0 + (-f64::from(self.network.logit(row))).exp());
@@ -115,10 +119,10 @@ impl Critic {
     }
 }
 
-/// What the critic reads of each decision: hidden state, flags of the simulator, step, task.
+/// The critic's inputs for each decision: hidden state, simulator flags, step, task.
 ///
-/// The step counts in parts of the task's horizon. In parts of the episode's own length it would tell the outcome of
-/// every task that ends on success.
+/// The step is relative to the task's horizon. Relative to the episode's own length it would reveal
+/// the outcome of every task that ends on success.
 fn inputs(episode: &RankingEpisode<'_>, tasks: &[TaskId]) -> Vec<Vec<f32>> {
     let RankingEpisode { episode, decisions, .. } = episode;
     let row = |(decision, step): (&DecisionSample, &usize)| {
@@ -142,14 +146,14 @@ mod tests {
         let values = [0.5, 0.75, 0.25];
         let one = advantages(&values, true, 1.0);
         assert_eq!(one, [0.5, 0.25, 0.75]);
-        // Without later values each is its own difference.
+        // Without later values, each advantage is only its own difference.
         assert_eq!(advantages(&values, false, 0.0), [0.25, -0.5, -0.25]);
         assert_eq!(advantages(&values, false, 0.5), [0.25 - 0.3125, -0.5 - 0.125, -0.25]);
         assert!(advantages(&[], true, 0.5).is_empty());
     }
 
     #[test]
-    fn an_episode_that_ends_early_looks_to_the_critic_like_one_that_goes_on() {
+    fn the_critic_cannot_see_when_an_episode_ends() {
         let long = episode("long", "stack", 1, false);
         let mut short = episode("short", "stack", 2, true);
         short.steps.truncate(2);
@@ -161,7 +165,7 @@ mod tests {
             inputs(&episode, std::slice::from_ref(&long.start.task))
         };
         assert_eq!(inputs(&short), inputs(&long)[..2]);
-        // Hidden state of two values, then the flags, then the third of 60 steps.
+        // Hidden state of two values, then the flags, then step 2 of 60.
         assert_eq!(inputs(&long)[2][2 + crate::training::STATISTICS], 2.0 / 60.0);
     }
 }

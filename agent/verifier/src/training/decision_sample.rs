@@ -1,4 +1,4 @@
-//! What a decision was between: the candidates of one recorded step, as training sees them.
+//! A decision for training: the candidates of one recorded step.
 
 use anyhow::{Context, ensure};
 use decision::{Candidate, Malformed, ObjectTracker, Parsed, ReasoningFeatures, TrackedObjects};
@@ -8,33 +8,34 @@ use store::record::{CandidateRecord, DecisionRecord, hidden_from_bytes};
 use super::records::CompletionReader;
 use crate::{CandidateFeatures, mean_hidden};
 
-/// One decision in which the executed candidate was drawn, not selected.
+/// A decision whose executed candidate was sampled, not selected.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DecisionSample {
     /// Mean hidden state of the well-formed candidates.
     pub hidden_mean: Vec<f32>,
-    /// What the simulator said after the step before, as 0 or 1; the verifier never sees it.
+    /// The simulator's statistics after the previous step, as 0 or 1. The verifier never uses them.
     pub statistics: [f32; STATISTICS],
-    /// How each well-formed candidate differs from the others, without a target; the first was executed.
+    /// The features of the well-formed candidates, without a target; the first one was executed.
     pub candidates: CandidateFeatures,
-    /// Where the gripper was: x and y in the base frame, metres; none for a robot whose state begins otherwise.
+    /// The gripper's position: x and y in the base frame, in metres. `None` for a robot whose state
+    /// starts with other dimensions.
     pub gripper: Option<[f32; 2]>,
-    /// Where the reasoning until then sees the objects.
+    /// Object positions according to the reasoning so far.
     pub tracked: TrackedObjects,
 }
 
 impl DecisionSample {
-    /// Whether the simulator said that the object was in the gripper.
+    /// Whether the object was in the gripper according to the simulator.
     pub fn is_grasped(&self) -> bool {
         self.statistics[1] > 0.5
     }
 }
 
-/// Flags of [`protocol::Statistics`].
+/// Number of flags in [`protocol::Statistics`].
 pub const STATISTICS: usize = 9;
 
-/// Reads a decision whose state and statistics were these, and tracks what its candidates see; none when hidden states of
-/// well-formed candidates were not kept.
+/// Reads a decision with its state and statistics, and updates the tracker with its candidates.
+/// `None` if hidden states of well-formed candidates are missing.
 pub fn read(
     decision: &DecisionRecord,
     state: &[f32],
@@ -48,7 +49,7 @@ pub fn read(
     let parsed = candidates.iter().filter_map(|candidate| candidate.parsed.as_ref().ok());
     let said: Vec<ReasoningFeatures> =
         parsed.filter_map(|parsed| ReasoningFeatures::of(&parsed.reasoning)).collect();
-    // As when it was scored, whether or not one of them was executed.
+    // As during scoring, independent of whether a candidate was executed.
     let tracked = tracker.note(&said);
     let size = well_formed().next().map_or(0, |candidate| candidate.hidden.len());
     if well_formed().any(|candidate| candidate.hidden.is_empty()) {
@@ -57,7 +58,7 @@ pub fn read(
     let rows: Vec<&[f32]> = well_formed().map(|candidate| &*candidate.hidden).collect();
     ensure!(
         rows.iter().all(|row| row.len() == size),
-        "expected hidden states of one size, got several"
+        "expected hidden states of equal length, got different lengths"
     );
     Ok(Some(DecisionSample {
         hidden_mean: mean_hidden(&rows, size),
@@ -68,7 +69,8 @@ pub fn read(
     }))
 }
 
-/// The candidate as the policy gave it; its hidden state is empty where it was not kept.
+/// The candidate as the policy proposed it; its hidden state is empty if the record does not
+/// contain it.
 fn candidate(record: &CandidateRecord, reader: CompletionReader<'_>) -> anyhow::Result<Candidate> {
     let CandidateRecord { tokens, log_probabilities, actions, malformed, hidden, .. } = record;
     let (parsed, confidence) = match actions {
@@ -76,12 +78,12 @@ fn candidate(record: &CandidateRecord, reader: CompletionReader<'_>) -> anyhow::
         Some(actions) => {
             ensure!(
                 tokens.len() == log_probabilities.len(),
-                "expected as many log-probabilities as tokens, got {} and {}",
+                "expected one log-probability per token, got {} for {} tokens",
                 log_probabilities.len(),
                 tokens.len()
             );
             let parsed = (reader.parse)(tokens).map_err(|malformed| {
-                anyhow::anyhow!("expected the tokens of a well-formed candidate: {malformed}")
+                anyhow::anyhow!("expected a well-formed candidate: {malformed}")
             })?;
             let confidence = (reader.confidence)(tokens, log_probabilities);
             (Ok(Parsed { actions: actions.clone(), ..parsed }), confidence)
@@ -98,7 +100,7 @@ fn candidate(record: &CandidateRecord, reader: CompletionReader<'_>) -> anyhow::
     })
 }
 
-/// In the order of the wire.
+/// The flags in the order of the protocol.
 fn flags(statistics: Statistics) -> [f32; STATISTICS] {
     let flags = [
         statistics.is_success,
@@ -120,7 +122,8 @@ mod tests {
     use decision::{ActionChunk, ActionSpace, Reasoning, Stage, VisibleObject};
     use store::record::hidden_to_bytes;
 
-    /// A candidate whose first token is 7 is grasping something at 70, one with a 9 is placing it at 90.
+    /// A candidate with first token 7 is grasping something at 70; with first token 9 it is placing
+    /// it at 90.
     fn parse(tokens: &[u32]) -> Result<Parsed, Malformed> {
         let side = tokens[0] as u16 * 10;
         let object = |side: u16| VisibleObject {
@@ -150,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn decisions_are_read_with_what_their_candidates_see_and_where_the_gripper_is() {
+    fn decisions_are_read_with_tracked_objects_and_the_gripper_position() {
         let space = ActionSpace { scale: vec![1.0; 7], gripper: Some(6) };
         let reader = CompletionReader {
             policy: "cafe",
@@ -171,7 +174,7 @@ mod tests {
         assert_eq!(first.hidden_mean, [0.1875]);
         assert_eq!(first.candidates.rows().len(), 2);
         assert_eq!(first.tracked.stage, Some(Stage::Grasp));
-        // The malformed one says nothing, and the second object is where both decisions see it.
+        // The malformed candidate has no boxes; the second object is averaged over both decisions.
         let second = read(vec![record(9, 0.125), record(0, 0.0)], grasped);
         let second = second.expect("a whole decision").expect("hidden states");
         assert!(second.is_grasped() && second.candidates.rows().len() == 1);
@@ -183,6 +186,6 @@ mod tests {
         assert_eq!(third, None);
         let short = CandidateRecord { log_probabilities: vec![-0.5], ..record(9, 0.125) };
         let error = read(vec![short], grasped).expect_err("damaged").to_string();
-        assert_eq!(error, "expected as many log-probabilities as tokens, got 1 and 7");
+        assert_eq!(error, "expected one log-probability per token, got 1 for 7 tokens");
     }
 }

@@ -7,32 +7,32 @@ use protocol::EpisodeOutcome;
 use store::plan::SeedRange;
 use store::record::EpisodeRecord;
 
-/// Why an episode is not used to train the verifier of a policy.
+/// Why an episode is excluded from training the verifier of a policy.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ExclusionReason {
-    /// Its layout is one of those kept for evaluation.
+    /// Its layout is reserved for evaluation.
     Layout(u32),
-    /// Its initial layout is not one of those for collection.
+    /// Its seed is outside the collection range.
     Seed(u64),
-    /// Its candidates were not sampled.
+    /// Its candidates were decoded greedily.
     Temperature(f32),
-    /// Its executed candidates were selected, so that their hidden states are not those of drawn candidates.
+    /// Its executed candidates were selected, which biases their hidden states.
     Selected(String),
-    /// Its hidden states mean something else to this policy.
+    /// Its hidden states are those of another policy.
     Policy(String),
-    /// It has no steps, so it has no outcome.
+    /// It has no steps and therefore no outcome.
     NoSteps,
-    /// The policy never acted, so the outcome is not its own.
+    /// The policy never acted, so the outcome is not the policy's.
     NeverActed,
 }
 
 impl ExclusionReason {
-    /// The reason in few words, the same for all episodes that it holds for.
+    /// A short reason, the same for all episodes that it applies to.
     pub fn summary(&self) -> &'static str {
         match self {
             ExclusionReason::Layout(_) => "evaluation layout",
             ExclusionReason::Seed(_) => "seed outside the collection range",
-            ExclusionReason::Temperature(_) => "greedy",
+            ExclusionReason::Temperature(_) => "greedy decoding",
             ExclusionReason::Selected(_) => "selected candidates",
             ExclusionReason::Policy(_) => "another policy",
             ExclusionReason::NoSteps => "no steps",
@@ -50,19 +50,19 @@ impl fmt::Display for ExclusionReason {
             }
             ExclusionReason::Seed(seed) => write!(
                 formatter,
-                "expected a seed of the collection range from {first} on, got {seed}"
+                "expected a seed in the collection range (from {first}), got {seed}"
             ),
             ExclusionReason::Temperature(temperature) => {
                 write!(formatter, "expected a temperature above 0, got {temperature}")
             }
             ExclusionReason::Selected(strategy) => write!(
                 formatter,
-                "expected executed candidates that were drawn (strategy {}), got strategy {strategy}",
+                "expected candidates that were sampled, not selected (strategy {}), got strategy {strategy}",
                 Strategy::Sample
             ),
             ExclusionReason::Policy(policy) => write!(
                 formatter,
-                "expected hidden states of the policy to train for, got policy {policy}"
+                "expected hidden states of the verifier's policy, got those of policy {policy}"
             ),
             ExclusionReason::NoSteps => {
                 write!(formatter, "expected an outcome, got an episode without steps")
@@ -77,12 +77,12 @@ impl fmt::Display for ExclusionReason {
 
 impl std::error::Error for ExclusionReason {}
 
-/// Whether the executed candidates of a strategy are draws: chosen by nothing but their place and their form.
+/// Whether a strategy executes sampled candidates without comparing them.
 fn is_drawn(strategy: &str) -> bool {
     matches!(strategy.parse(), Ok(Strategy::Sample | Strategy::FirstWellFormed))
 }
 
-/// What excludes an episode from training the verifier of the policy with this digest, as far as its label tells.
+/// The reason that excludes an episode from training, as far as its label shows.
 pub fn exclude_label(outcome: &EpisodeOutcome, policy: &str) -> Option<ExclusionReason> {
     if let Some(layout) = outcome.layout {
         Some(ExclusionReason::Layout(layout))
@@ -101,7 +101,7 @@ pub fn exclude_label(outcome: &EpisodeOutcome, policy: &str) -> Option<Exclusion
     }
 }
 
-/// What excludes an episode, by its whole record.
+/// The reason that excludes an episode from training, according to its record.
 pub fn exclude_record(record: &EpisodeRecord, policy: &str) -> Option<ExclusionReason> {
     exclude_label(&store::labels::outcome(record), policy)
         .or_else(|| (!record.has_outcome()).then_some(ExclusionReason::NeverActed))

@@ -1,4 +1,4 @@
-//! The verifier while it is trained: the same network in candle's tensors, with equation 4 as its loss.
+//! The verifier's network during training: candle tensors with equation 4 as the loss.
 
 use anyhow::ensure;
 use candle_core::{Device, Tensor, Var};
@@ -7,7 +7,7 @@ use rand::Rng;
 
 use crate::{Layer, Network, Standardisation};
 
-/// Three affine layers whose weights an optimizer can change.
+/// Three affine layers with trainable weights.
 pub struct Learner {
     variables: [(Var, Var); 3],
     layers: [Linear; 3],
@@ -24,7 +24,7 @@ pub struct Samples {
 }
 
 impl Samples {
-    /// Standardises rows and gives every sample the weight of its class.
+    /// Standardises the rows and assigns class weights.
     pub fn new<'a>(
         standardisation: &Standardisation,
         rows: impl Iterator<Item = &'a [f32]>,
@@ -47,9 +47,10 @@ impl Samples {
 }
 
 impl Learner {
-    /// First weights: uniform with the bound 1 / sqrt(inputs), so that every layer starts at about the scale of its input.
+    /// Initialises the weights uniformly within 1 / sqrt(inputs), so that every layer keeps the
+    /// scale of its input.
     ///
-    /// They are drawn here because candle's generator on the CPU takes no seed.
+    /// They are sampled here because candle's CPU generator has no seed.
     pub fn new(
         input_size: usize,
         hidden_sizes: [usize; 2],
@@ -65,19 +66,19 @@ impl Learner {
             Ok((Var::from_tensor(&weight)?, Var::from_tensor(&bias)?))
         };
         let variables = [layer(input_size, first)?, layer(first, second)?, layer(second, 1)?];
-        // A variable's tensor shares its storage, so the layers follow every step of the optimizer.
+        // A variable's tensor shares its storage, so the layers see every optimizer step.
         let layers = variables.each_ref().map(|(weight, bias)| {
             Linear::new(weight.as_tensor().clone(), Some(bias.as_tensor().clone()))
         });
         Ok(Learner { variables, layers })
     }
 
-    /// All that the optimizer changes.
+    /// All trainable variables.
     pub fn variables(&self) -> Vec<Var> {
         self.variables.iter().flat_map(|(weight, bias)| [weight.clone(), bias.clone()]).collect()
     }
 
-    /// Equation 4 over one batch of samples.
+    /// Equation 4 for one batch of samples.
     pub fn loss(&self, samples: &Samples, batch: &[u32]) -> anyhow::Result<Tensor> {
         let batch = Tensor::new(batch, &Device::Cpu)?;
         let logits = self.forward(&samples.hidden.index_select(&batch, 0)?)?;
@@ -94,7 +95,7 @@ impl Learner {
         last.forward(&values)?.squeeze(1)
     }
 
-    /// The weights as they are now, ready to score.
+    /// The current weights as a network for scoring.
     pub fn network(&self, standardisation: &Standardisation) -> anyhow::Result<Network> {
         let mut layers = Vec::with_capacity(3);
         for (weight, bias) in &self.variables {
@@ -106,10 +107,12 @@ impl Learner {
     }
 }
 
-/// Binary cross-entropy of each logit z with its label y: softplus(z) - y z, with softplus(z) = max(z, 0) + ln(1 + e^-|z|).
+/// Binary cross-entropy of each logit z with its label y: softplus(z) - y z, with softplus(z) =
+/// max(z, 0) + ln(1 + e^-|z|).
 ///
-/// Never a logarithm of a sigmoid: that is ln 0 from a logit of about 17 on in 32 bits. candle's gradients of `relu` and
-/// `abs` at 0 are both 1, which together give the right slope of 1/2 there.
+/// The logarithm of a sigmoid would become ln 0 in 32 bits for logits of about 17 and more.
+/// candle's gradients of `relu` and `abs` at 0 are both 1, which together give the correct slope of
+/// 1/2.
 fn cross_entropy(logits: &Tensor, labels: &Tensor) -> candle_core::Result<Tensor> {
     let rest = (logits.abs()?.neg()?.exp()? + 1.0)?.log()?;
     (logits.relu()? + rest)? - (logits * labels)?
@@ -123,7 +126,7 @@ mod tests {
 
     use crate::weighted_loss;
 
-    /// Value and slope of the loss at one logit, against the formula in f64.
+    /// Compares value and slope of the loss at one logit with the formula in f64.
     fn check(logit: f32, label: f32) {
         let logits = Var::from_slice(&[logit], 1, &Device::Cpu).expect("a tensor");
         let labels = Tensor::new(&[label], &Device::Cpu).expect("a tensor");

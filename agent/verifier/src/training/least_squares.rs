@@ -1,18 +1,19 @@
-//! Ridge regression of one number on a few others, by the normal equations.
+//! Ridge regression by the normal equations.
 
-/// The normal equations of a regression: what its solution depends on, however many samples there were.
+/// The normal equations of a regression; their size does not depend on the number of samples.
 pub struct NormalEquations {
     /// (terms, terms): mean products of the terms with each other.
     squares: Vec<Vec<f64>>,
-    /// (terms): mean products of the terms with the number.
+    /// (terms): mean products of the terms with the target number.
     products: Vec<f64>,
 }
 
-/// Rounds of coordinate descent: far more than so few weights take to settle, and still only milliseconds.
+/// Rounds of coordinate descent: far more than needed for so few weights, and still only
+/// milliseconds.
 const ROUNDS: usize = 1000;
 
 impl NormalEquations {
-    /// Of samples, each with its terms and its number.
+    /// The equations of samples, each with its terms and its target number.
     pub fn of(terms: usize, samples: impl ExactSizeIterator<Item = (Vec<f64>, f64)>) -> Self {
         let count = samples.len().max(1) as f64;
         let (mut squares, mut products) = (vec![vec![0.0; terms]; terms], vec![0.0; terms]);
@@ -30,7 +31,8 @@ impl NormalEquations {
         self.squares[term][term] += ridge;
     }
 
-    /// The weights of least squared error plus ridge, by Cholesky's factors L L' of the squares.
+    /// The weights with the least squared error plus ridge, by the Cholesky factors L L' of the
+    /// squares.
     pub fn solve(&self) -> Vec<f64> {
         let terms = self.products.len();
         let mut lower = self.squares.clone();
@@ -54,7 +56,7 @@ impl NormalEquations {
         weights
     }
 
-    /// The same with every weight on its side of 0, by coordinate descent.
+    /// The same with a sign constraint for every weight, by coordinate descent.
     pub fn solve_with_signs(&self, is_negative: impl Fn(usize) -> bool) -> Vec<f64> {
         let mut weights = vec![0.0; self.products.len()];
         for _ in 0..ROUNDS {
@@ -73,7 +75,7 @@ impl NormalEquations {
 mod tests {
     use super::*;
 
-    /// y = 3 a - 2 b + 0.5 on points that determine it.
+    /// y = 3 a - 2 b + 0.5 at points that determine it.
     fn equations() -> NormalEquations {
         let points = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [2.0, 3.0], [-1.0, 1.0]];
         let samples = points.map(|[a, b]| (vec![1.0, a, b], 3.0 * a - 2.0 * b + 0.5));
@@ -92,12 +94,13 @@ mod tests {
     }
 
     #[test]
-    fn a_weight_on_the_wrong_side_is_0_and_the_others_are_the_best_without_it() {
+    fn a_constrained_weight_is_0_and_the_others_are_optimal_without_it() {
         let weights = equations().solve_with_signs(|_| false);
         assert_eq!(weights[2], 0.0);
-        // Without b: the regression of y on 1 and a, whose free solution would have a negative constant.
+        // Without b: the regression of y on 1 and a, whose unconstrained solution has a negative
+        // constant.
         assert_eq!(weights[0], 0.0);
-        // Sums of a y and a a over the points: 3.5 + 1.0 + 4.5 and 1 + 4 + 1.
+        // Sums of a y and of a a over the points: 3.5 + 1.0 + 4.5 and 1 + 4 + 1.
         check(&weights, [0.0, 9.0 / 6.0, 0.0]);
     }
 

@@ -1,23 +1,24 @@
-//! Trains a verifier on finished episodes: every step of a success is a positive, every step of a failure a negative.
+//! Trains a verifier on finished episodes: the steps of a success are positives, the steps of a
+//! failure negatives.
 //!
 //! ```text
 //! records ─▶ eligible episodes ─▶ split by initial layout ─┬▶ training: network, by equation 4
-//!                                                          ├▶ validation: when its training stops
-//!                                                          └▶ held out: its quality, and nothing else
-//! grasps, places of successes ─▶ target model: where the gripper should go ┐
-//! drawn candidates ─▶ critic ─▶ advantages ────────────────────────────────┴▶ ranking: which candidate is better
+//!                                                          ├▶ validation: when training stops
+//!                                                          └▶ held out: metrics only
+//! grasps, releases of successes ─▶ target model: where the gripper should go ┐
+//! sampled candidates ─▶ critic ─▶ advantages ────────────────────────────────┴▶ ranking: which candidate is better
 //! ```
 //!
 //! The same episodes, options and seed give the same file.
 
-// What is trained on.
+// Training data.
 mod decision_sample;
 mod eligibility;
 pub mod records;
 mod set;
 mod split;
 
-// What is fitted.
+// Models.
 mod advantage;
 mod learner;
 mod least_squares;
@@ -45,7 +46,7 @@ use learner::{Learner, Samples};
 /// One pass over the training samples.
 #[derive(Clone, Copy, Debug)]
 pub struct Epoch {
-    /// Counted from 1.
+    /// Number of the epoch, from 1.
     pub epoch: usize,
     /// Mean loss of the pass, in nats.
     pub training_loss: f64,
@@ -55,10 +56,10 @@ pub struct Epoch {
     pub is_best: bool,
 }
 
-/// Trains until the validation loss stops falling, keeps the weights of its lowest point and judges them on the held-out
-/// episodes.
+/// Trains until the validation loss stops falling, keeps the weights with the lowest validation
+/// loss and measures them on the held-out episodes.
 ///
-/// The same set, policy and options give the same file, whatever the order in which the episodes came.
+/// The same set, policy and options give the same file, independent of the order of the episodes.
 pub fn train(
     set: &TrainingSet,
     policy: &str,
@@ -92,7 +93,8 @@ pub fn train(
     Verifier::new(&network, ranking.as_ref(), &description)
 }
 
-/// Fits the network to the training episodes; also the pass after which the validation loss was lowest.
+/// Fits the network to the training episodes; also returns the epoch with the lowest validation
+/// loss.
 fn fit(
     set: &TrainingSet,
     split: &Split,
@@ -121,7 +123,8 @@ fn fit(
         let network = learner.network(&standardisation)?;
         let validation = score(set, &split.validation, &network);
         let validation_loss = weighted_loss(&validation.logits, &validation.labels, positive_share);
-        let validation_loss = validation_loss.context("validation episodes without samples")?;
+        let validation_loss = validation_loss
+            .context("validation episodes: expected at least one sample, got none")?;
         ensure!(
             validation_loss.is_finite(),
             "epoch {epoch}: expected a finite validation loss, got {validation_loss}"
@@ -139,14 +142,14 @@ fn fit(
     Ok((epochs, network))
 }
 
-/// Counts the sides of the split; each needs successes and failures, or there is nothing to tell apart.
+/// Counts episodes and samples of the split. Each part needs successes and failures.
 fn data(set: &TrainingSet, split: &Split) -> anyhow::Result<TrainingData> {
     let count = |name: &str, side: &[usize]| {
         let episodes = side.len();
         let successes = side.iter().filter(|index| set.episodes()[**index].is_success).count();
         ensure!(
             successes > 0 && successes < episodes,
-            "{name} episodes: expected successes and failures, got {successes} successes of {episodes}; collect more episodes"
+            "{name} episodes: expected successes and failures, got {successes} successes in {episodes} episodes; collect more episodes"
         );
         Ok((episodes, successes, set.labels(side).len()))
     };
@@ -170,7 +173,7 @@ fn data(set: &TrainingSet, split: &Split) -> anyhow::Result<TrainingData> {
     })
 }
 
-/// One pass over the samples in the given order; the mean loss.
+/// One pass over the samples in the given order; returns the mean loss.
 fn pass(
     learner: &Learner,
     optimizer: &mut AdamW,
@@ -187,9 +190,9 @@ fn pass(
     Ok(sum / order.len() as f64)
 }
 
-/// Scores the executed candidates of episodes with the network's plain loops, not with the tensors that were trained. The
-/// ranking tells candidates of one decision apart, of which only one was executed, so that it has no place in these
-/// figures.
+/// Scores the executed candidates of episodes with the network, not with the training tensors. The
+/// ranking compares candidates of one decision, of which only one was executed, so it is not part
+/// of these metrics.
 fn score(set: &TrainingSet, episodes: &[usize], network: &Network) -> ScoredSamples {
     let mut samples = ScoredSamples::default();
     for episode in episodes.iter().map(|episode| &set.episodes()[*episode]) {

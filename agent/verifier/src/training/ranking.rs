@@ -1,8 +1,8 @@
-//! Fits the ranking: what makes a candidate better than the others, by ridge regression on advantages.
+//! Fits the ranking of candidates by ridge regression on advantages.
 //!
-//! No weight may say that a candidate is better the less sure the policy was of it, or the farther it is from the others.
-//! Outliers are rare, so that a free regression gives such features whatever weight chance gives them; and best-of-N
-//! selects outliers (the optimizer's curse).
+//! No weight may favour lower confidence or a larger distance from the other candidates. Outliers
+//! are rare, so an unconstrained regression would give these features random weights, and best-of-N
+//! selects outliers (optimizer's curse).
 
 use std::collections::BTreeMap;
 
@@ -17,17 +17,19 @@ use crate::{
     TrainingOptions,
 };
 
-/// Parts of the episodes, of which each is judged by what was fitted to the others.
+/// Number of folds; each one is evaluated by models fitted to the others.
 const FOLDS: usize = 5;
-/// No ranking is fitted to fewer episodes: they say nothing about single decisions.
+/// Minimum number of episodes for a ranking.
 pub const EPISODES_MIN: usize = 20;
-/// A feature that varies less carries nothing.
+/// A feature with a smaller scale is constant.
 const SCALE_MIN: f64 = 1e-6;
 
-/// The ranking of the given episodes and its cross-fitted gain; none when too few of them have decisions.
+/// The ranking of the given episodes and its cross-fitted gain; `None` if too few of them have
+/// decisions.
 ///
-/// Cross-fitting is nested. The weights that judge a fold are regressed on the advantages and targets of the other
-/// folds, and those come from critics and target models that saw neither the judged fold nor the one that they value.
+/// Cross-fitting is nested. The weights that evaluate a fold are regressed on the advantages and
+/// targets of the other folds. These come from critics and target models that were fitted without
+/// the evaluated fold and without the fold that they value.
 pub fn fit(
     set: &TrainingSet,
     indices: &[usize],
@@ -73,7 +75,7 @@ pub fn fit(
     Ok(Some((ranking, evidence)))
 }
 
-/// For every two folds, and for every one, what was fitted to the episodes of all others.
+/// For each fold and each pair of folds: the models fitted to all other episodes.
 struct Models {
     by_folds: BTreeMap<(usize, usize), (Critic, TargetModel)>,
     decay: f64,
@@ -90,7 +92,8 @@ impl Models {
         Ok(Models { by_folds, decay: options.advantage_decay })
     }
 
-    /// Of an episode, by models that saw neither its own fold nor the other.
+    /// The estimate for an episode, by models that were fitted without its own fold and without the
+    /// fold `other`.
     fn estimate(&self, episode: &RankingEpisode<'_>, other: usize) -> Estimate {
         let (first, second) = (episode.fold.min(other), episode.fold.max(other));
         let (critic, targets) = &self.by_folds[&(first, second)];
@@ -109,17 +112,19 @@ impl Models {
     }
 }
 
-/// What each decision of an episode was between, and what the executed candidate changed.
+/// The candidates of each decision of an episode, and the advantage of the executed candidate.
 struct Estimate {
     candidates: Vec<CandidateFeatures>,
     advantages: Vec<f64>,
 }
 
 impl Estimate {
-    /// What choosing by `score` in one decision at a time would change, summed over the episode, in percentage points.
+    /// The change if `score` selected the candidate in one decision at a time, summed over the
+    /// episode, in percentage points.
     ///
-    /// The executed candidate was a uniform draw, so each decision in which it happens to be the best one counts as many
-    /// times as there were candidates: an estimate without bias for a single decision.
+    /// The executed candidate was sampled uniformly. A decision in which it happens to be the best
+    /// one is therefore weighted by the number of candidates, which makes the estimate unbiased for
+    /// a single decision.
     fn gain(&self, score: impl Fn(&[f32]) -> f64) -> f64 {
         let decision = |(candidates, advantage): (&CandidateFeatures, &f64)| {
             let scores: Vec<f64> = candidates.rows().iter().map(|row| score(row)).collect();
@@ -132,7 +137,8 @@ impl Estimate {
     }
 }
 
-/// The mean of the episodes' gains, whose error counts episodes of one layout as one cluster.
+/// The mean gain of the episodes with a cluster-robust standard error; episodes with the same
+/// layout are one cluster.
 fn mean_gain(episodes: &[(&LayoutKey, f64)]) -> ReRankingGain {
     let count = episodes.len() as f64;
     let mean = episodes.iter().map(|(_, gain)| gain).sum::<f64>() / count;
@@ -152,7 +158,7 @@ fn regress(layout: FeatureLayout, samples: &[(Vec<f32>, f64)], ridge: f64) -> Ve
     let scale = |index: usize| {
         let squares = samples.iter().map(|(features, _)| f64::from(features[index]).powi(2));
         let scale = (squares.sum::<f64>() / count).sqrt();
-        // Infinite, which gives it no weight, for a feature that does not vary.
+        // An infinite scale gives a constant feature no weight.
         if scale < SCALE_MIN { f64::INFINITY } else { scale }
     };
     let scales: Vec<f64> = (0..layout.length()).map(scale).collect();

@@ -1,4 +1,4 @@
-//! Training episodes from records: which are eligible, and what they become.
+//! Reads training episodes from records and checks their eligibility.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,29 +14,29 @@ use super::decision_sample::{self, DecisionSample};
 use super::eligibility::{ExclusionReason, exclude_label, exclude_record};
 use super::set::{LayoutKey, TrainingEpisode};
 
-/// What the policy's own code says of recorded completions; records keep tokens.
+/// Decodes recorded completions with the policy's code; records contain only tokens.
 #[derive(Clone, Copy)]
 pub struct CompletionReader<'a> {
-    /// Digest of the policy whose verifier is trained.
+    /// Digest of the policy of the verifier.
     pub policy: &'a str,
-    /// How its actions compare.
+    /// How to compare its actions.
     pub action_space: &'a ActionSpace,
-    /// Reads a candidate's tokens.
+    /// Parses a candidate's tokens.
     pub parse: &'a dyn Fn(&[u32]) -> Result<Parsed, Malformed>,
-    /// How sure it was of a candidate's parts, from tokens and as many log-probabilities.
+    /// Computes the confidence of a candidate's parts from its tokens and their log-probabilities.
     pub confidence: ReadConfidence<'a>,
 }
 
-/// From tokens and as many log-probabilities to one number for each part.
+/// From tokens and their log-probabilities to one number per part.
 pub type ReadConfidence<'a> = &'a dyn Fn(&[u32], &[f32]) -> Vec<f32>;
 
-/// Numbers of excluded episodes by reason.
+/// Number of excluded episodes by reason.
 pub type Excluded = BTreeMap<&'static str, usize>;
 
-/// The episodes of the given runs, and how many of them have no outcome; refuses, naming the record, when one is not
-/// eligible for another reason.
+/// The episodes of the given runs, and the number of those without an outcome. Fails and names the
+/// record if one is ineligible for another reason.
 ///
-/// A run was named by hand: leaving a part of it out in silence would hide a mistake.
+/// These runs were named explicitly: silently excluding a part of them would hide a mistake.
 pub fn from_runs(
     folders: &[PathBuf],
     reader: CompletionReader<'_>,
@@ -57,9 +57,9 @@ pub fn from_runs(
     Ok((episodes, excluded))
 }
 
-/// The eligible episodes of a label store, and how many were excluded for which reason.
+/// The eligible episodes of a label store, and the number of excluded ones by reason.
 ///
-/// Every run feeds the store, evaluations included, so most exclusions are in order here.
+/// Every run writes to the store, including evaluations, so most exclusions are expected here.
 pub fn from_labels(
     path: &Path,
     reader: CompletionReader<'_>,
@@ -87,11 +87,11 @@ pub fn from_labels(
     Ok((episodes, excluded))
 }
 
-/// The record of a label, or why it cannot be used: a run's folder may be removed and made again, or damaged. Such a
-/// record costs the training one episode, not all others.
+/// The record of a label, or why it cannot be used: the run's folder may have been removed,
+/// recreated or damaged. Such a record excludes one episode, not all others.
 fn record_of(path: &Path, label: &EpisodeOutcome) -> Result<EpisodeRecord, &'static str> {
     if !path.exists() {
-        return Err("record is gone");
+        return Err("record is missing");
     }
     let record = EpisodeRecord::read(path).map_err(|error| {
         tracing::warn!("excluded from training: {error:#}");
@@ -102,15 +102,15 @@ fn record_of(path: &Path, label: &EpisodeOutcome) -> Result<EpisodeRecord, &'sta
     }
     if labels::outcome(&record) != *label {
         tracing::warn!(
-            "excluded from training: the record {} disagrees with its label",
+            "excluded from training: the record {} differs from its label",
             path.display()
         );
-        return Err("record disagrees with its label");
+        return Err("record differs from its label");
     }
     Ok(record)
 }
 
-/// The record as a training episode; refuses one that is not eligible.
+/// The record as a training episode; fails if it is not eligible.
 pub fn eligible_episode(
     record: &EpisodeRecord,
     reader: CompletionReader<'_>,
@@ -141,7 +141,7 @@ fn training_episode(
             Ok((executed(decision)?, sample))
         };
         let (executed, sample) = read().with_context(|| format!("step {index}"))?;
-        // Else the robot held still: no candidate was executed.
+        // Otherwise the robot held still: no candidate was executed.
         let Some(executed) = executed else { continue };
         hidden.extend(executed);
         steps.push(index);
@@ -164,7 +164,7 @@ fn training_episode(
     })
 }
 
-/// The hidden state of the executed candidate; none where the robot held still.
+/// The hidden state of the executed candidate; `None` if the robot held still.
 fn executed(decision: &DecisionRecord) -> anyhow::Result<Option<Vec<f32>>> {
     let Some(chosen) = decision.chosen else { return Ok(None) };
     let drawn = decision.candidates.iter().position(|candidate| candidate.actions.is_some());

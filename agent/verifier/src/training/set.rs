@@ -1,4 +1,4 @@
-//! The samples that a verifier is trained on, kept by episode.
+//! The samples for training a verifier, grouped by episode.
 
 use anyhow::{bail, ensure};
 use decision::TaskId;
@@ -6,50 +6,50 @@ use decision::TaskId;
 use super::decision_sample::DecisionSample;
 use super::split::{self, Split};
 
-/// What an episode starts from. Episodes of one start share most of what decides their outcome, whatever was sampled, so
-/// they are never on two sides of a split.
+/// The start of an episode. Episodes with the same start share most of what determines their
+/// outcome, so they are never in different parts of a split.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct LayoutKey {
     /// The task and its variant.
     pub task: TaskId,
-    /// The initial layout; none for one drawn from `seed`.
+    /// Number of the fixed initial layout; `None` for one generated from `seed`.
     pub layout: Option<u32>,
-    /// The environment's seed.
+    /// Seed of the environment.
     pub seed: u64,
 }
 
-/// One finished episode as the verifier sees it.
+/// One finished episode for training.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrainingEpisode {
-    /// What to call it in a message; unique in a set.
+    /// Name for messages; unique in a set.
     pub name: String,
-    /// What it started from.
+    /// The start of the episode.
     pub start: LayoutKey,
-    /// What the robot was told.
+    /// The language instruction for the robot.
     pub instruction: String,
-    /// Its outcome at the last step: the label of all its samples.
+    /// The outcome at the last step: the label of all its samples.
     pub is_success: bool,
     /// (samples, input size), row by row: the executed candidates' last hidden states.
     pub hidden: Vec<f32>,
-    /// The control step of each sample; a step in which the robot held still has none.
+    /// The control step of each sample; a step in which the robot held still has no sample.
     pub steps: Vec<usize>,
-    /// Control steps of the episode.
+    /// Number of control steps of the episode.
     pub steps_total: usize,
     /// The task's horizon in control steps.
     pub steps_max: usize,
-    /// What the decision of each sample was between; none unless there were several candidates with hidden states.
+    /// One decision per sample; `None` unless there were several candidates with hidden states.
     pub decisions: Option<Vec<DecisionSample>>,
 }
 
 impl TrainingEpisode {
-    /// Whether the other one took the same course.
+    /// Whether the other episode had the same course.
     fn is_repeated_by(&self, other: &TrainingEpisode) -> bool {
         (self.is_success, &self.steps, &self.hidden)
             == (other.is_success, &other.steps, &other.hidden)
     }
 }
 
-/// Episodes to train on, all of one policy.
+/// Training episodes of one policy.
 #[derive(Clone, Debug)]
 pub struct TrainingSet {
     input_size: usize,
@@ -59,8 +59,9 @@ pub struct TrainingSet {
 }
 
 impl TrainingSet {
-    /// Collects episodes of a policy with these sizes of hidden states and actions, in an order of their own, so that the
-    /// order of arrival makes no difference. An episode that was run twice, by the same seeds, counts once.
+    /// Collects episodes of a policy with these sizes of hidden states and actions. They are
+    /// sorted, so that the order of arrival has no effect. An episode that was run twice with the
+    /// same seeds counts once.
     pub fn new(
         input_size: usize,
         action_length: usize,
@@ -72,10 +73,11 @@ impl TrainingSet {
             check(episode, input_size, action_length)
                 .map_err(|error| error.context(format!("episode {}", episode.name)))?;
         }
-        // The name comes last: it holds a run's random digits, and a repeated collection must give the same order.
+        // The name comes last, because it contains a run's random digits: a repeated collection
+        // must have the same order.
         episodes.sort_by(|a, b| (&a.start, &a.name).cmp(&(&b.start, &b.name)));
         if let Some(twins) = episodes.windows(2).find(|pair| pair[0].name == pair[1].name) {
-            bail!("episode {}: expected once, got twice", twins[0].name);
+            bail!("episode {}: expected only one with this name, got two", twins[0].name);
         }
         let all = episodes.len();
         let mut different: Vec<TrainingEpisode> = Vec::with_capacity(all);
@@ -94,7 +96,7 @@ impl TrainingSet {
         self.input_size
     }
 
-    /// Numbers of an action.
+    /// Number of dimensions of an action.
     pub fn action_length(&self) -> usize {
         self.action_length
     }
@@ -104,12 +106,12 @@ impl TrainingSet {
         &self.episodes
     }
 
-    /// How many episodes were left out because another one is the same.
+    /// Number of episodes that were left out because they repeat another one.
     pub fn repeats(&self) -> usize {
         self.repeats
     }
 
-    /// Shares the episodes out; see [`split::split`].
+    /// Splits the episodes; see [`split::split`].
     pub fn split(&self, validation_share: f64, held_out_share: f64, seed: u64) -> Split {
         split::split(&self.episodes, validation_share, held_out_share, seed)
     }
@@ -146,7 +148,7 @@ fn check(episode: &TrainingEpisode, input_size: usize, action_length: usize) -> 
     let Some(decisions) = &episode.decisions else { return Ok(()) };
     ensure!(
         decisions.len() == samples,
-        "expected {samples} decisions, as many as samples, got {}",
+        "expected {samples} decisions, one per sample, got {}",
         decisions.len()
     );
     for (index, decision) in decisions.iter().enumerate() {
@@ -226,9 +228,9 @@ pub(super) mod tests {
         );
         assert_eq!(
             broken(|episode| episode.decisions = Some(Vec::new())),
-            "episode broken: expected 3 decisions, as many as samples, got 0"
+            "episode broken: expected 3 decisions, one per sample, got 0"
         );
         let twice = vec![episode("same", "a", 1, true), episode("same", "a", 1, false)];
-        assert_eq!(refuse(twice), "episode same: expected once, got twice");
+        assert_eq!(refuse(twice), "episode same: expected only one with this name, got two");
     }
 }

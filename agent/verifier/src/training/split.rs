@@ -1,7 +1,8 @@
-//! Which episodes are fitted to, which stop the training and which judge the result: by initial layout, never by episode.
+//! Splits episodes into training, validation and held-out parts by initial layout.
 //!
-//! Two collections with one seed start from the same layouts, and the layout alone says much about the outcome: a split by
-//! episode would measure how well layouts are remembered, and one by sample even how well episodes are.
+//! Two collections with the same seed start from the same layouts, and the layout has a large
+//! effect on the outcome. A split by episode would measure how well layouts are memorised, and a
+//! split by sample even how well episodes are memorised.
 
 use std::collections::BTreeMap;
 
@@ -12,22 +13,22 @@ use rand_chacha::ChaCha8Rng;
 
 use super::set::{LayoutKey, TrainingEpisode};
 
-/// A stratum with this many layouts has one on every side.
+/// A stratum with at least this many layouts has one in every part.
 const LAYOUTS_MIN: usize = 3;
 
-/// Indices of episodes by what they are used for; no layout is on two sides.
+/// Indices of episodes in each part; no layout is in two parts.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Split {
     /// The network is fitted to these.
     pub training: Vec<usize>,
-    /// Training stops by the loss on these.
+    /// The loss on these stops the training.
     pub validation: Vec<usize>,
-    /// Nothing is fitted to or chosen by these.
+    /// These are used neither for fitting nor for selection.
     pub held_out: Vec<usize>,
 }
 
-/// Takes the shares of the layouts of every task, of mostly successful and mostly failed ones alike, rounded to whole
-/// layouts.
+/// Takes the shares of the layouts of every task, separately for mostly successful and mostly
+/// failed layouts, rounded to whole layouts.
 pub fn split(
     episodes: &[TrainingEpisode],
     validation_share: f64,
@@ -57,7 +58,7 @@ pub fn split(
     split
 }
 
-/// Deals episodes to folds by their layouts; the fold of each.
+/// Assigns episodes to folds by their layouts; returns the fold of each.
 pub fn folds<'a>(
     starts: impl Iterator<Item = &'a LayoutKey>,
     folds: usize,
@@ -90,7 +91,8 @@ mod tests {
     use super::*;
     use crate::training::set::tests::episode;
 
-    /// `repeats` episodes of each of `layouts` layouts, of which the first `successes` layouts succeed.
+    /// `repeats` episodes of each of `layouts` layouts, of which the first `successes` layouts
+    /// succeed.
     fn episodes(
         task: &str,
         layouts: usize,
@@ -122,15 +124,15 @@ mod tests {
         let sides = [&shares.training, &shares.validation, &shares.held_out];
         let mut all: Vec<usize> = sides.into_iter().flatten().copied().collect();
         all.sort_unstable();
-        assert_eq!(all, (0..75).collect::<Vec<_>>(), "every episode is on one side");
+        assert_eq!(all, (0..75).collect::<Vec<_>>(), "every episode is in one part");
         assert_eq!(shares, split(&episodes, 0.1, 0.2, 9));
         assert_ne!(shares, split(&episodes, 0.1, 0.2, 10));
     }
 
     #[test]
-    fn no_layout_is_on_two_sides_or_in_two_folds() {
+    fn no_layout_is_in_two_parts_or_in_two_folds() {
         let mut episodes = episodes("a", 40, 20, 3);
-        // Repeats of a layout may end differently.
+        // Repeats of a layout may have different outcomes.
         episodes.iter_mut().step_by(4).for_each(|episode| episode.is_success ^= true);
         let shares = split(&episodes, 0.2, 0.3, 1);
         let seeds = |side: &[usize]| -> BTreeSet<u64> {
@@ -161,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn three_layouts_are_enough_for_three_sides() {
+    fn three_layouts_are_enough_for_three_parts() {
         let shares = split(&episodes("a", 3, 3, 1), 0.1, 0.2, 0);
         assert_eq!(
             (shares.training.len(), shares.validation.len(), shares.held_out.len()),

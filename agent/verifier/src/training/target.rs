@@ -1,7 +1,8 @@
-//! Learns where the gripper should go from where it was when things went right.
+//! Fits the target model to the gripper's positions at grasps and at releases of successes.
 //!
-//! A grasp happens where the reasoning saw the object, and a success lets go where it saw the other one. Each single
-//! position is millimetres off, as sampled actions are; the regression over hundreds of them is not.
+//! A grasp happens at the first object of the reasoning, and a success releases it at the second
+//! one. Each single position is a few millimetres off, because actions are sampled; the regression
+//! over hundreds of them is precise.
 
 use std::collections::BTreeMap;
 
@@ -12,25 +13,26 @@ use super::decision_sample::DecisionSample;
 use super::least_squares::NormalEquations;
 use crate::{TERMS, TargetMap, TargetModel, terms};
 
-/// Fewer samples say too little about so many terms.
+/// Minimum number of samples per map, because it has so many terms.
 const SAMPLES_MIN: usize = 40;
-/// Keeps terms that hardly vary from being fitted to chance; the sum of the squared distances grows by this times each
-/// squared coefficient.
+/// Ridge penalty: the sum of squared distances grows by this times each squared coefficient. It
+/// keeps terms that hardly vary from being fitted to noise.
 const RIDGE: f64 = 0.1;
-/// Samples farther from the first fit than this many times the median distance are outliers and left out of the second.
+/// A sample is an outlier if its distance from the first fit exceeds this many median distances.
+/// Outliers are excluded from the second fit.
 const OUTLIER_MEDIANS: f64 = 3.0;
 
-/// The gripper where it should be: the terms of the object's bounds, and the gripper's x and y.
+/// A gripper position: the terms of the object's bounds, and the gripper's x and y.
 type Sample = ([f64; TERMS], [f64; 2]);
 
-/// The maps of every instruction of which the episodes in use have enough samples.
+/// The maps of all instructions with enough samples in the used episodes.
 pub fn fit(
     episodes: &[RankingEpisode<'_>],
     is_used: impl Fn(&RankingEpisode<'_>) -> bool,
 ) -> anyhow::Result<TargetModel> {
     let mut samples: BTreeMap<(&str, Stage), Vec<Sample>> = BTreeMap::new();
     for RankingEpisode { episode, decisions, .. } in episodes.iter().filter(|one| is_used(one)) {
-        // An object is where it was seen until the first grasp; it was brought to its place when it is let go.
+        // Until the first grasp the object has not moved; at its release it is at its destination.
         let first = decisions.iter().find(|decision| decision.is_grasped());
         let last = decisions.iter().rev().find(|decision| decision.is_grasped());
         let found = [(Stage::Grasp, first), (Stage::Place, last.filter(|_| episode.is_success))];
@@ -54,7 +56,7 @@ fn sample(decision: &DecisionSample, stage: Stage) -> Option<Sample> {
     Some((terms(&bounds), decision.gripper?.map(f64::from)))
 }
 
-/// Least squares with ridge, twice: the second time without the outliers of the first.
+/// Least squares with ridge, twice: the second fit excludes the outliers of the first.
 fn map(samples: &[Sample]) -> anyhow::Result<TargetMap> {
     let all: Vec<&Sample> = samples.iter().collect();
     let first = solve(&all);
@@ -79,7 +81,7 @@ fn solve(samples: &[&Sample]) -> [Vec<f64>; 2] {
         let samples = samples.iter().map(|(terms, gripper)| (terms.to_vec(), gripper[axis]));
         let count = samples.len() as f64;
         let mut equations = NormalEquations::of(TERMS, samples);
-        // The constant is free.
+        // The constant has no penalty.
         (1..TERMS).for_each(|term| equations.add_ridge(term, RIDGE / count));
         equations.solve()
     })
@@ -94,13 +96,14 @@ mod tests {
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    /// Where the gripper belongs for a box, in metres.
+    /// The true gripper position for a box, in metres.
     fn truth(bounds: &BoundingBox) -> [f32; 2] {
         let middle = [(bounds[0] + bounds[2]) / 2.0 - 128.0, (bounds[1] + bounds[3]) / 2.0 - 128.0];
         [0.3 + 0.002 * middle[1] + 4e-6 * middle[0] * middle[1], -0.1 - 0.0015 * middle[0]]
     }
 
-    /// A decision with the object in the gripper or not, which is `off` metres from where it belongs.
+    /// A decision with or without the object in the gripper, which is `off` metres from its true
+    /// position.
     fn holding(bounds: BoundingBox, is_grasped: bool, off: f32) -> DecisionSample {
         let [x, y] = truth(&bounds);
         let mut decision = decision(&[vec![0.0; 16]]);
@@ -112,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_are_learned_from_successes_to_the_millimetre() {
+    fn maps_are_learned_from_successes_with_millimetre_precision() {
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let mut bounds = || -> BoundingBox {
             let (left, top) = (random.random_range(60.0..150.0), random.random_range(60.0..150.0));
@@ -125,14 +128,15 @@ mod tests {
         };
         let boxes: Vec<BoundingBox> = (0..300).map(|_| bounds()).collect();
         let all = boxes.iter().enumerate().map(|(index, &bounds)| {
-            // A tenth of them is nowhere near; what comes before and after is no sample.
+            // A tenth are outliers; the decisions before and after are not samples.
             let off = if index % 10 == 0 { 0.2 } else { 0.005 * ((index % 7) as f32 - 3.0) / 3.0 };
             let decisions = vec![
                 holding(bounds, true, 0.1),
                 holding(bounds, true, off),
                 holding(bounds, false, 0.3),
             ];
-            // Every tenth but the outliers: a failure says nothing of where to let go.
+            // Every tenth episode, except the outliers, is a failure, from which no release
+            // position is learned.
             let mut one = episode("one", "stack", index as u64, index % 10 != 5);
             one.instruction = if index < 280 { "stack it" } else { "seldom" }.to_owned();
             (one, decisions)

@@ -1,4 +1,4 @@
-//! Verifiers of made-up episodes: what is learned, what is held out, what is refused.
+//! Verifiers of synthetic episodes: learning, held-out data, refusals.
 
 use decision::{
     ActionChunk, ActionSpace, Candidate, Image, Parsed, Reasoning, ScoringRequest, TaskId,
@@ -9,7 +9,7 @@ use rand::Rng;
 use super::*;
 use crate::CandidateFeatures;
 
-/// A decision between candidates of one action that differ in their confidence; no object is tracked.
+/// A decision between candidates with equal actions and different confidence; no object is tracked.
 pub(super) fn decision(confidence: &[Vec<f32>]) -> DecisionSample {
     let candidates: Vec<Candidate> =
         confidence.iter().map(|confidence| candidate(&[], confidence)).collect();
@@ -38,7 +38,8 @@ fn candidate(hidden: &[f32], confidence: &[f32]) -> Candidate {
     }
 }
 
-/// Episodes of two tasks whose success shows, noisily, in the second of four features; the rest is noise.
+/// Episodes of two tasks. The second of four features predicts success, with noise; the others are
+/// noise.
 fn synthetic(episodes: usize, signal: f32, seed: u64) -> Vec<TrainingEpisode> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut episode = |number: usize| {
@@ -84,7 +85,7 @@ fn trained(episodes: Vec<TrainingEpisode>, options: &TrainingOptions) -> Verifie
 }
 
 #[test]
-fn what_shows_in_the_hidden_state_is_learned() {
+fn a_signal_in_the_hidden_state_is_learned() {
     let verifier = trained(synthetic(60, 2.0, 1), &options());
     let VerifierDescription { data, held_out, .. } = verifier.description();
     let TrainingData { training_episodes, validation_episodes, held_out_episodes, .. } = data;
@@ -93,7 +94,7 @@ fn what_shows_in_the_hidden_state_is_learned() {
     assert!(held_out.auroc.macro_average.expect("both classes") > 0.85, "{held_out:?}");
     assert!(held_out.loss.expect("samples") < 0.5, "{held_out:?}");
     assert_eq!(held_out.auroc.tasks.len(), 2);
-    // And the sign is right: more of the second feature is better.
+    // The sign is correct: a larger second feature is better.
     let candidates = [[5.0, 9.0, 5.0, 5.0], [5.0, 1.0, 5.0, 5.0]];
     let candidates = candidates.map(|hidden| candidate(&hidden, &[]));
     let logits = verifier.logits(&ScoringRequest {
@@ -109,7 +110,7 @@ fn what_shows_in_the_hidden_state_is_learned() {
 }
 
 #[test]
-fn nothing_is_found_where_nothing_is() {
+fn nothing_is_learned_without_a_signal() {
     let verifier = trained(synthetic(60, 0.0, 2), &options());
     let auroc = verifier.description().held_out.auroc.pooled.expect("both classes");
     assert!((auroc - 0.5).abs() < 0.1, "{auroc}");
@@ -120,7 +121,7 @@ fn same_episodes_same_bytes_in_any_order_and_run() {
     let episodes = synthetic(30, 1.0, 3);
     let mut shuffled = episodes.clone();
     shuffled.reverse();
-    // A run's name has random digits.
+    // A run's name contains random digits.
     for (index, episode) in shuffled.iter_mut().enumerate() {
         episode.name = format!("again {index}");
     }
@@ -144,7 +145,7 @@ fn training_stops_at_the_lowest_validation_loss() {
 }
 
 #[test]
-fn held_out_episodes_change_nothing_but_the_figures() {
+fn held_out_episodes_change_only_the_metrics() {
     let mut episodes = synthetic(60, 1.0, 6);
     for (number, episode) in episodes.iter_mut().enumerate() {
         let confidence = |step: usize| vec![((number * 7 + step * 3) % 11) as f32 * -0.2; 16];
@@ -181,19 +182,19 @@ fn held_out_episodes_change_nothing_but_the_figures() {
 }
 
 #[test]
-fn one_sided_outcomes_are_refused() {
+fn outcomes_of_a_single_class_are_refused() {
     let mut episodes = synthetic(10, 1.0, 5);
     episodes.iter_mut().for_each(|episode| episode.is_success = true);
     let set = TrainingSet::new(4, 7, episodes).expect("a whole set");
     let error = train(&set, "cafe", &options(), |_| ()).err().expect("no failures");
     assert_eq!(
         error.to_string(),
-        "training episodes: expected successes and failures, got 6 successes of 6; collect more episodes"
+        "training episodes: expected successes and failures, got 6 successes in 6 episodes; collect more episodes"
     );
 }
 
 #[test]
-fn senseless_options_are_refused() {
+fn invalid_options_are_refused() {
     let set = TrainingSet::new(4, 7, synthetic(10, 1.0, 5)).expect("a whole set");
     let refuse = |options: TrainingOptions| {
         train(&set, "cafe", &options, |_| ()).err().expect("refused").to_string()
@@ -204,7 +205,7 @@ fn senseless_options_are_refused() {
     );
     assert_eq!(
         refuse(TrainingOptions { validation_share: 0.75, held_out_share: 0.25, ..options() }),
-        "validation and held-out share: expected less than 1 together, got 1"
+        "validation and held-out share: expected a sum below 1, got 1"
     );
     assert_eq!(
         refuse(TrainingOptions { epochs_max: 0, ..options() }),

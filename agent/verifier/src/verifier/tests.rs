@@ -1,4 +1,4 @@
-//! Verifiers with arbitrary weights, the shipped one, and broken ones.
+//! Verifiers with arbitrary weights, the shipped verifier, and broken files.
 
 use decision::{
     ActionChunk, ActionSpace, Image, Malformed, Parsed, Reasoning, Stage, TrackedObjects,
@@ -50,7 +50,7 @@ fn plain(seed: u64) -> Verifier {
     Verifier::new(&network(seed), None, &description()).expect("a whole verifier")
 }
 
-/// The same with weights that prefer what the policy was surer of.
+/// The same with a ranking that prefers higher confidence.
 fn ranking(seed: u64) -> Verifier {
     let mut weights = vec![0.0; BRIDGE.length()];
     weights[0] = 0.25;
@@ -65,7 +65,7 @@ fn ranking(seed: u64) -> Verifier {
     Verifier::new(&network(seed), Some(&ranking), &description).expect("a whole verifier")
 }
 
-/// A candidate that differs from others in the log-probability of its first part.
+/// A candidate with this log-probability of its first part.
 fn candidate(log_probability: f32, hidden: &[f32]) -> Candidate {
     let mut confidence = vec![0.0; BRIDGE.confidence().len()];
     confidence[0] = log_probability;
@@ -90,7 +90,7 @@ fn malformed(hidden: &[f32]) -> Candidate {
     }
 }
 
-/// Scores candidates; `change` what the request says beside them.
+/// Scores candidates after `change` has modified the request.
 fn score_with(
     verifier: &Verifier,
     candidates: &[Candidate],
@@ -115,12 +115,12 @@ fn score(verifier: &Verifier, candidates: &[Candidate]) -> anyhow::Result<Vec<f3
 }
 
 #[test]
-fn the_ranking_tells_candidates_apart_and_the_situation_is_that_of_the_mean() {
-    // The second is malformed: its hidden state must not count.
+fn the_network_scores_the_mean_state_and_the_ranking_compares_candidates() {
+    // The second candidate is malformed: its hidden state must not contribute.
     let candidates = [candidate(-2.0, &[0.1; 5]), malformed(&[9.0; 5]), candidate(-1.0, &[0.5; 5])];
     let logits = score(&ranking(1), &candidates).expect("scores");
     let situation = network(1).logit(&[0.3; 5]);
-    // Half a nat off the mean: 4 logits per probability x 0.25 x 0.5.
+    // Half a nat from the mean: 4 logits per probability x 0.25 x 0.5.
     for (found, expected) in [logits[0], logits[2]].iter().zip([situation - 0.5, situation + 0.5]) {
         assert!((found - expected).abs() < 1e-5, "{logits:?} around {situation}");
     }
@@ -156,7 +156,7 @@ fn a_broken_file_is_refused() {
     assert!(
         refuse(&plain.expect("an empty file")).contains("expected metadata \"rever.verifier\"")
     );
-    // The last four bytes are a mean; NaN in place of it.
+    // The last four bytes are a mean; they are replaced by NaN.
     let mut broken = bytes;
     let end = broken.len();
     broken[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
@@ -220,14 +220,14 @@ fn candidates_that_cannot_be_scored_are_an_error() {
     let error = score_with(&ranking(1), &[candidate(0.0, &[0.0; 5])], &shorter, |_| ());
     assert_eq!(
         error.expect_err("another action length").to_string(),
-        "expected a policy with actions of 7 numbers, got 6"
+        "expected a policy with 7 action dimensions, got 6"
     );
-    // What is malformed needs no score.
+    // A malformed candidate needs no score.
     assert_eq!(score(&plain(1), &[malformed(&[])]).expect("scores"), [0.0]);
 }
 
 #[test]
-fn a_row_does_not_depend_on_its_batch() {
+fn a_score_does_not_depend_on_the_batch() {
     let candidates: Vec<Candidate> = (0..80)
         .map(|row| {
             let hidden: Vec<f32> = (0..5).map(|i| (row * 7 + i * 3) as f32 * 0.013 - 2.0).collect();
@@ -277,8 +277,9 @@ impl Numbers {
 }
 
 #[test]
-fn the_shipped_file_scores_as_it_did_when_it_was_shipped() {
-    // Computed by the program of commit 091f8b1, which trained the file; only the name of its policy has changed since.
+fn the_shipped_verifier_gives_the_same_scores_as_when_it_was_trained() {
+    // Computed at commit 091f8b1, which trained the file; only the name of its policy has changed
+    // since.
     const EXPECTED: [(&str, Option<Stage>, [u32; 5]); 3] = [
         (
             "put carrot on plate",

@@ -1,8 +1,9 @@
-//! Action tokens: OpenVLA's bins, turned into the environment's metres, rotation vector and gripper.
+//! Action tokens: OpenVLA's bins and their conversion to metres, rotation vector and gripper
+//! command.
 
 use crate::checkpoint::config::{ACTION_LENGTH, ActionScale};
 
-/// The token ids of actions and what they mean.
+/// The token ids of actions and their meaning.
 pub struct ActionBins {
     vocabulary: usize,
     bins: usize,
@@ -15,12 +16,13 @@ impl ActionBins {
         ActionBins { vocabulary, bins, scale }
     }
 
-    /// Whether an id stands for an action bin.
+    /// Whether an id is an action token.
     pub fn contains(&self, id: u32) -> bool {
         (self.vocabulary - self.bins..self.vocabulary).contains(&(id as usize))
     }
 
-    /// The centre of an id's bin in -1..1. There is one centre fewer than ids: the last two share.
+    /// The bin centre of an id, in -1..1. There is one centre fewer than there are ids: the last
+    /// two ids share one.
     pub fn centre(&self, id: u32) -> f64 {
         assert!(self.contains(id), "action id: expected one of the last {}, got {id}", self.bins);
         let digit = self.vocabulary - id as usize;
@@ -29,7 +31,7 @@ impl ActionBins {
         -1.0 + (2 * index + 1) as f64 / centres as f64
     }
 
-    /// Metres, rotation vector in radians, and the gripper: +1 open, -1 closed.
+    /// The action: metres, rotation vector in radians, gripper +1 open or -1 closed.
     pub fn decode(&self, ids: [u32; ACTION_LENGTH]) -> [f32; ACTION_LENGTH] {
         let physical: [f64; ACTION_LENGTH] = std::array::from_fn(|index| {
             let centre = self.centre(ids[index]);
@@ -42,7 +44,7 @@ impl ActionBins {
         [x, y, z, rotation[0], rotation[1], rotation[2], gripper].map(|number| number as f32)
     }
 
-    /// What counts as one unit of each number of an action: its range, and 2 for the gripper.
+    /// The unit of each dimension of an action: its range, and 2 for the gripper.
     pub fn units(&self) -> [f32; ACTION_LENGTH] {
         let mut units = [2.0; ACTION_LENGTH];
         for (index, unit) in units.iter_mut().enumerate().take(ACTION_LENGTH - 1) {
@@ -54,7 +56,8 @@ impl ActionBins {
     }
 }
 
-/// Axis times angle of a turn about fixed x by roll, then fixed y by pitch, then fixed z by yaw.
+/// The rotation vector of a rotation about the fixed axes: roll about x, then pitch about y, then
+/// yaw about z.
 pub fn rotation_vector(roll: f64, pitch: f64, yaw: f64) -> [f64; 3] {
     let (sr, cr) = (roll / 2.0).sin_cos();
     let (sp, cp) = (pitch / 2.0).sin_cos();
@@ -63,12 +66,12 @@ pub fn rotation_vector(roll: f64, pitch: f64, yaw: f64) -> [f64; 3] {
     let mut axis =
         [sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy];
     if w < 0.0 {
-        // The same turn, by the shorter way.
+        // The same rotation with the smaller angle.
         w = -w;
         axis = axis.map(|number| -number);
     }
     let sine = axis.iter().map(|number| number * number).sum::<f64>().sqrt();
-    // Near zero the angle is twice its half's sine.
+    // Near zero, angle / sin(angle / 2) approaches 2.
     let factor = if sine < 1e-9 { 2.0 } else { 2.0 * sine.atan2(w) / sine };
     axis.map(|number| number * factor)
 }

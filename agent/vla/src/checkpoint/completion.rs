@@ -1,4 +1,4 @@
-//! Completions read back: the text of tokens, candidates' reasoning and action, confidence. Needs no weights.
+//! Parses completions: text, reasoning, action and confidence of a candidate. Needs no weights.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use super::identity::identity;
 use super::prompt::Prompter;
 use super::{confidence, parse};
 
-/// What a checkpoint's configuration and tokenizer say about its completions.
+/// Everything in a checkpoint's configuration and tokenizer that is needed to parse completions.
 pub struct CompletionParser {
     pub(crate) config: Config,
     pub(crate) prompter: Prompter,
@@ -20,7 +20,8 @@ pub struct CompletionParser {
 }
 
 impl CompletionParser {
-    /// Reads config.json and tokenizer.json of a checkpoint's folder, and the checkpoint's identity.
+    /// Loads config.json and tokenizer.json from a checkpoint folder and computes the checkpoint's
+    /// identity.
     pub fn load(directory: &Path) -> Result<CompletionParser> {
         let load = || -> Result<CompletionParser> {
             let config = Config::load(&directory.join("config.json"))?;
@@ -33,7 +34,8 @@ impl CompletionParser {
         load().with_context(|| format!("cannot load the policy in {}", directory.display()))
     }
 
-    /// The checkpoint's identity: SHA-256 of what it computes, in hexadecimal.
+    /// The checkpoint's identity: SHA-256 of its configuration, tokenizer and weights, in
+    /// hexadecimal.
     pub fn digest(&self) -> &str {
         &self.digest
     }
@@ -60,7 +62,7 @@ impl CompletionParser {
         self.config.text.hidden_size
     }
 
-    /// How the numbers of the checkpoint's actions compare.
+    /// The dimensions of the checkpoint's actions and their units.
     pub fn action_space(&self) -> ActionSpace {
         ActionSpace { scale: self.bins.units().to_vec(), gripper: Some(ACTION_LENGTH - 1) }
     }
@@ -70,12 +72,12 @@ impl CompletionParser {
         self.prompter.text(tokens)
     }
 
-    /// Reads a candidate's tokens (without `</s>`) as reasoning and action.
+    /// Parses a candidate's tokens (without `</s>`) as reasoning and action.
     pub fn parse(&self, tokens: &[u32]) -> Result<Parsed, Malformed> {
         parse::parse(tokens, self.config.reasoning, &self.bins, &self.prompter)
     }
 
-    /// How sure the policy was of each part of a candidate; one log-probability per token.
+    /// The policy's confidence in each part of a candidate, from one log-probability per token.
     pub fn confidence(&self, tokens: &[u32], log_probabilities: &[f32]) -> Vec<f32> {
         confidence::confidence(tokens, log_probabilities, &self.bins, &self.prompter)
     }

@@ -1,18 +1,20 @@
-//! How sure the policy was of each part of a candidate: its log-probabilities, summed by ECoT's tags and action numbers.
+//! The policy's confidence in each part of a candidate: log-probabilities summed per ECoT tag and
+//! per action dimension.
 
 use crate::checkpoint::actions::ActionBins;
 use crate::checkpoint::config::ACTION_LENGTH;
 use crate::checkpoint::prompt::Prompter;
 use decision::{TAGS, last_tag};
 
-/// One part for each tag's text, then one for each number of the action.
+/// One part per tag, then one per action dimension.
 const PARTS: usize = TAGS.len() + ACTION_LENGTH;
 
-/// A token counts as no less likely than e^-8: a single outlier must not outweigh all the rest.
+/// Lower bound of a token's log-probability: a single outlier must not dominate the sum.
 const LOG_PROBABILITY_MIN: f32 = -8.0;
 
-/// Sums `log_probabilities`, one of each token, by part. A token belongs to the tag in whose text it ends, what comes
-/// before any tag to the first; the action's tokens stand for themselves.
+/// Sums `log_probabilities` (one per token) by part. A token belongs to the section in which it
+/// ends; tokens before the first tag belong to the first section. Each action token is its own
+/// part.
 pub fn confidence(
     tokens: &[u32],
     log_probabilities: &[f32],
@@ -25,10 +27,10 @@ pub fn confidence(
     for (index, (&token, log_probability)) in tokens.iter().zip(log_probabilities).enumerate() {
         let part = if bins.contains(token) {
             actions += 1;
-            // A malformed candidate may have more; nobody executes it.
+            // A malformed candidate may have more action tokens; it is never executed.
             TAGS.len() + (actions - 1).min(ACTION_LENGTH - 1)
         } else {
-            // A tag ends with a colon, so that only few prefixes must be read.
+            // Every tag ends with a colon, so that only few prefixes have to be decoded.
             if prompter.has_colon(token) {
                 let text = prompter.text(&tokens[..=index]);
                 section = last_tag(&text, length).unwrap_or(section);

@@ -1,4 +1,4 @@
-//! A checkpoint's `config.json`: OpenVLA's fields, read strictly; unknown layouts are refused.
+//! A checkpoint's `config.json` with OpenVLA's fields. Unknown layouts are refused.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::network::rotary::HeadShape;
 
-/// Numbers of an action: three of translation, three of rotation, the gripper.
+/// Dimensions of an action: three of translation, three of rotation, the gripper.
 pub const ACTION_LENGTH: usize = 7;
-/// Tokens of one completion when the checkpoint states no limit; ECoT's own limit.
+/// Maximum tokens of a completion if the checkpoint states no limit; this is ECoT's own limit.
 const REASONING_TOKENS_MAX: usize = 1024;
 
 const OPENVLA_PROMPT: &str = "In: What action should the robot take to {instruction}?\nOut:";
@@ -18,24 +18,25 @@ const VICUNA_PROMPT: &str = "A chat between a curious user and an artificial int
     assistant. The assistant gives helpful, detailed, and polite answers to the user's questions. \
     USER: What action should the robot take to {instruction}? ASSISTANT: TASK:";
 
-/// What the network and its inputs and outputs look like; as JSON, part of the checkpoint's identity.
+/// The architecture, inputs and outputs of the network; its JSON is part of the checkpoint's
+/// identity.
 #[derive(Debug, Clone, Serialize)]
 pub struct Config {
-    /// The first is DINO-like when there are two.
+    /// With two towers, the first one is DINO-like.
     pub towers: Vec<TowerConfig>,
     pub image_size: usize,
     pub text: TextConfig,
-    /// Tokens that the tokenizer knows; the embedding has padding rows above them.
+    /// Size of the tokenizer's vocabulary; the embedding has padding rows above it.
     pub vocabulary: usize,
     pub action_bins: usize,
     pub action_scale: ActionScale,
     pub prompt_template: String,
-    /// Whether completions think aloud before the action.
+    /// Whether completions contain a chain of thought before the action.
     pub reasoning: bool,
     pub completion_tokens_max: usize,
 }
 
-/// One vision transformer in timm's terms.
+/// One vision transformer, with timm's field names.
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct TowerConfig {
@@ -50,7 +51,7 @@ pub struct TowerConfig {
     pub layer_scale: bool,
 }
 
-/// The Llama decoder; what `text_config` leaves out has Hugging Face's defaults.
+/// The Llama decoder. Fields missing in `text_config` have Hugging Face's defaults.
 #[derive(Debug, Clone, Deserialize, Serialize)]
 #[serde(default)]
 pub struct TextConfig {
@@ -95,16 +96,17 @@ impl Default for TextConfig {
     }
 }
 
-/// How normalised actions become physical: the 1st and 99th percentile of the training data.
+/// The scale from normalised to physical actions: 1st and 99th percentile of the training data.
 #[derive(Debug, Clone, Deserialize, Serialize)]
 pub struct ActionScale {
     pub q01: [f64; ACTION_LENGTH],
     pub q99: [f64; ACTION_LENGTH],
-    /// False for a number that is used as it is.
+    /// False for a dimension that is not normalised.
     pub mask: [bool; ACTION_LENGTH],
 }
 
-/// The file as written: fields that decide the layout. Training leftovers are not read.
+/// The fields of the file that determine the layout. Fields that matter only for training are
+/// ignored.
 #[derive(Deserialize)]
 struct File {
     model_type: String,
@@ -135,7 +137,7 @@ struct DatasetStatistics {
 }
 
 impl Config {
-    /// Reads and checks `config.json`.
+    /// Loads and checks `config.json`.
     pub fn load(path: &Path) -> Result<Config> {
         let name = path.display();
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {name}"))?;
@@ -171,7 +173,7 @@ impl Config {
         let vocabulary = file.text_config.vocab_size.saturating_sub(file.pad_to_multiple_of);
         ensure!(
             file.n_action_bins == 256 && vocabulary > 256,
-            "n_action_bins: expected 256 below a vocabulary of {vocabulary}, got {}",
+            "n_action_bins: expected 256 in a vocabulary of more than 256 tokens ({vocabulary}), got {}",
             file.n_action_bins
         );
         let limit = if file.reasoning { REASONING_TOKENS_MAX } else { ACTION_LENGTH + 1 };
@@ -207,7 +209,7 @@ impl File {
                 (Some(known), None) => Ok(known),
                 (None, Some(described)) => Ok(described.clone()),
                 (Some(_), Some(_)) => {
-                    bail!("vision_config: {id} is known, expected none beside it")
+                    bail!("vision_config: expected none, because {id} is a known tower")
                 }
                 (None, None) => bail!("timm_model_ids: {id} is unknown and has no vision_config"),
             }
@@ -224,11 +226,11 @@ impl File {
         let key = match (&self.unnorm_key, datasets.as_slice()) {
             (Some(key), _) => key,
             (None, [only]) => *only,
-            (None, _) => bail!("unnorm_key: expected one of {datasets:?}, got none"),
+            (None, _) => bail!("unnorm_key: expected one of {datasets:?} in config.json, got none"),
         };
         let statistics = self.norm_stats.get(key);
         let statistics = statistics
-            .with_context(|| format!("unnorm_key: expected one of {datasets:?}, got {key}"))?;
+            .with_context(|| format!("unnorm_key: expected one of {datasets:?}, got {key:?}"))?;
         let scale = statistics.action.clone();
         let finite = scale.q01.iter().chain(&scale.q99).all(|number| number.is_finite());
         ensure!(finite, "norm_stats of {key}: expected finite q01 and q99, got {scale:?}");
@@ -241,7 +243,7 @@ impl File {
             (None, "llama2-7b-pure") => OPENVLA_PROMPT,
             (None, "vicuna-v15-7b") => VICUNA_PROMPT,
             (None, other) => {
-                bail!("prompt_template: expected one, as llm_backbone_id {other:?} implies none")
+                bail!("prompt_template: expected one, because llm_backbone_id {other:?} is unknown")
             }
         };
         ensure!(
@@ -253,7 +255,7 @@ impl File {
 }
 
 impl TowerConfig {
-    /// The towers of OpenVLA-7B by timm's names.
+    /// The vision towers of OpenVLA-7B by their timm names.
     fn of_timm(id: &str) -> Option<TowerConfig> {
         let tower = TowerConfig {
             image_size: 224,
@@ -307,17 +309,17 @@ impl TowerConfig {
         self.image_size / self.patch_size
     }
 
-    /// Tokens before the patches.
+    /// Number of class and register tokens before the patches.
     pub fn prefix_tokens(&self) -> usize {
         usize::from(self.class_token) + self.registers
     }
 
-    /// Width of the hidden layer of each block.
+    /// Width of the hidden layer of each MLP.
     pub fn mlp_width(&self) -> usize {
         (self.embed_dim as f64 * self.mlp_ratio).round() as usize
     }
 
-    /// Heads of every block.
+    /// Attention heads of every block.
     pub fn head_shape(&self) -> HeadShape {
         let size = self.embed_dim / self.num_heads;
         HeadShape { heads: self.num_heads, key_value_heads: self.num_heads, size }
@@ -336,7 +338,7 @@ impl TextConfig {
         let (heads, key_value_heads) = (self.num_attention_heads, self.key_value_heads());
         ensure!(
             heads > 0 && self.hidden_size.is_multiple_of(2 * heads),
-            "num_attention_heads: expected heads of even size in {}, got {heads}",
+            "num_attention_heads: expected an even head size for hidden_size {}, got {heads} heads",
             self.hidden_size
         );
         ensure!(
@@ -351,7 +353,7 @@ impl TextConfig {
         self.num_key_value_heads.unwrap_or(self.num_attention_heads)
     }
 
-    /// Heads of every layer.
+    /// Attention heads of every layer.
     pub fn head_shape(&self) -> HeadShape {
         HeadShape {
             heads: self.num_attention_heads,

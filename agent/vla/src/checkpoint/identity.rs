@@ -1,8 +1,9 @@
-//! A checkpoint's identity: the digest of what it computes, not of how its files are written.
+//! A checkpoint's identity: a digest of what it computes, independent of how its files are written.
 //!
-//! Two folders have the same one exactly when configuration (with defaults filled in and only the chosen dataset's
-//! statistics), tokenizer and the weights that are used have the same values. Shards, key order, indentation, the
-//! number format of the weights, comments and fields that nothing reads make no difference.
+//! Two folders have the same identity exactly if the following have equal values: the configuration
+//! with defaults filled in and only the selected dataset's statistics, the tokenizer, and the
+//! weights in use. Shards, key order, indentation, the dtype of the weights, comments and unused
+//! fields do not matter.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -18,18 +19,18 @@ use super::config::Config;
 use super::weights::{is_dead, weight_files};
 use crate::network::vision::VisionBackbone;
 
-/// Numbers that are converted at a time: weights may be larger than the memory.
+/// Number of weights converted at a time: the file may be larger than the memory.
 const CHUNK: usize = 1 << 16;
-/// The largest header that the safetensors format allows, bytes.
+/// Maximum header size of the safetensors format, in bytes.
 const HEADER_BYTES_MAX: u64 = 100_000_000;
 
-/// One tensor in a file.
+/// A tensor in a file.
 struct Stored {
     name: String,
     dtype: Dtype,
     shape: Vec<usize>,
     file: PathBuf,
-    /// First byte in the file.
+    /// Offset in the file.
     begin: u64,
     bytes: usize,
 }
@@ -54,13 +55,14 @@ pub fn identity(directory: &Path, config: &Config) -> Result<String> {
     Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
-/// Hashes bytes behind their number, so that no two lists of parts are hashed alike.
+/// Hashes a part with its length before it, so that different lists of parts have different
+/// digests.
 fn part(hasher: &mut Sha256, bytes: &[u8]) {
     hasher.update((bytes.len() as u64).to_le_bytes());
     hasher.update(bytes);
 }
 
-/// All that an output depends on, by name.
+/// All tensors that affect an output, sorted by name.
 fn used_tensors(directory: &Path, config: &Config) -> Result<Vec<Stored>> {
     let towers = VisionBackbone::blocks_used(&config.towers);
     let towers: Vec<(&str, usize)> =
@@ -74,7 +76,7 @@ fn used_tensors(directory: &Path, config: &Config) -> Result<Vec<Stored>> {
     Ok(tensors)
 }
 
-/// What a safetensors file's header lists.
+/// The tensors in a safetensors file's header.
 fn stored_in(path: &Path) -> Result<Vec<Stored>> {
     let mut file = File::open(path)?;
     let mut length = [0; 8];
@@ -99,7 +101,7 @@ fn stored_in(path: &Path) -> Result<Vec<Stored>> {
 }
 
 impl Stored {
-    /// Hashes the numbers as the network sees them, in 32 bits.
+    /// Hashes the numbers in 32 bits, as the network uses them.
     fn hash_values(&self, hasher: &mut Sha256) -> Result<()> {
         let (width, widen): (usize, fn(&[u8]) -> f32) = match self.dtype {
             Dtype::F32 => (4, bytemuck::pod_read_unaligned),

@@ -1,4 +1,4 @@
-//! What a checkpoint's files say: configuration, tokenizer, prompt, action bins, weights, completions.
+//! Reads a checkpoint's files: configuration, tokenizer, prompt, action bins, weights, completions.
 
 pub mod actions;
 pub mod completion;

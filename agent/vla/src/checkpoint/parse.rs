@@ -1,4 +1,4 @@
-//! A completion as reasoning and action, or what is malformed about it.
+//! Parses a completion into reasoning and action, or reports why it is malformed.
 
 use decision::{ActionChunk, Malformed, Parsed, Reasoning};
 
@@ -6,7 +6,7 @@ use super::actions::ActionBins;
 use super::config::ACTION_LENGTH;
 use super::prompt::{LLAMA_SPACE, Prompter};
 
-/// Whether nothing but `</s>` can follow, or nothing can make the completion well-formed any more.
+/// Whether only `</s>` can follow, or the completion cannot become well-formed any more.
 pub fn is_complete(tokens: &[u32], bins: &ActionBins) -> bool {
     let Some(start) = tokens.iter().position(|&id| bins.contains(id)) else {
         return false;
@@ -15,7 +15,7 @@ pub fn is_complete(tokens: &[u32], bins: &ActionBins) -> bool {
     strange || tokens.len() > start + ACTION_LENGTH
 }
 
-/// Parses a completion whose `</s>` has been taken off.
+/// Parses a completion without its `</s>`.
 pub fn parse(
     tokens: &[u32],
     reasoning: bool,
@@ -25,7 +25,7 @@ pub fn parse(
     let start = tokens.iter().position(|&id| bins.contains(id)).unwrap_or(tokens.len());
     let (thought, action) = tokens.split_at(start);
     let thought = match thought {
-        // A Llama tokenizer's lone space before the action ids.
+        // The single space that a Llama tokenizer inserts before action tokens.
         [thought @ .., LLAMA_SPACE] => thought,
         thought => thought,
     };

@@ -1,4 +1,5 @@
-//! Prompts and completions as token ids: the checkpoint's tokenizer and prompt template.
+//! Converts prompts and completions to and from token ids with the checkpoint's tokenizer and
+//! prompt template.
 
 use std::path::Path;
 
@@ -6,30 +7,31 @@ use anyhow::{Result, anyhow, ensure};
 
 use crate::checkpoint::config::Config;
 
-/// A Llama tokenizer's lone space, which stands between a prompt (or `ACTION:`) and action ids.
+/// The single space of a Llama tokenizer, which separates a prompt (or `ACTION:`) from action
+/// tokens.
 pub const LLAMA_SPACE: u32 = 29871;
 const LLAMA_SPACE_TEXT: &str = "▁";
 
-/// Turns instructions into prompt ids and ids into text.
+/// Encodes instructions as prompts and decodes completions.
 pub struct Prompter {
     tokenizer: tokenizers::Tokenizer,
     template: String,
     first: u32,
-    /// Whether actions are told without reasoning by a model of Llama's vocabulary.
+    /// Whether the prompt ends with a space: Llama's vocabulary without reasoning.
     space_ends_prompt: bool,
-    /// The first tag, when the template already opens the reasoning.
+    /// The first tag, if the prompt template already contains it.
     opened: &'static str,
 }
 
 impl Prompter {
-    /// Reads `tokenizer.json`.
+    /// Loads `tokenizer.json`.
     pub fn load(path: &Path, config: &Config) -> Result<Prompter> {
         let tokenizer = tokenizers::Tokenizer::from_file(path)
             .map_err(|error| anyhow!("cannot read {}: {error}", path.display()))?;
         let size = tokenizer.get_vocab_size(true);
         ensure!(
             size == config.vocabulary || size == config.vocabulary + 1,
-            "tokenizer.json: expected {} tokens (and at most one for padding), got {size}",
+            "tokenizer.json: expected {} tokens and at most one for padding, got {size}",
             config.vocabulary
         );
         let llama = tokenizer.id_to_token(LLAMA_SPACE).as_deref() == Some(LLAMA_SPACE_TEXT);
@@ -43,7 +45,8 @@ impl Prompter {
         })
     }
 
-    /// The first token and the prompt; the image goes between the first token and the rest.
+    /// The first token and the prompt. The image tokens are inserted between the first token and
+    /// the rest.
     pub fn ids(&self, instruction: &str) -> Result<Vec<u32>> {
         let text = self.template.replace("{instruction}", &instruction.to_lowercase());
         let encoding = self
@@ -60,14 +63,14 @@ impl Prompter {
         Ok(ids)
     }
 
-    /// Whether an id's text has a colon.
+    /// Whether the text of an id contains a colon.
     pub fn has_colon(&self, id: u32) -> bool {
         self.tokenizer.id_to_token(id).is_some_and(|text| text.contains(':'))
     }
 
-    /// The text of a completion, with the tag that its prompt may have opened.
+    /// The text of a completion, including the tag that the prompt may have opened.
     pub fn text(&self, ids: &[u32]) -> String {
-        // Ids come out of the vocabulary, so only a broken decoder in tokenizer.json can fail here.
+        // All ids are in the vocabulary, so only a broken decoder in tokenizer.json can fail here.
         match self.tokenizer.decode(ids, false) {
             Ok(text) => format!("{}{text}", self.opened),
             Err(error) => format!("(tokenizer.json cannot decode {ids:?}: {error})"),

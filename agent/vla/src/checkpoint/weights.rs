@@ -1,4 +1,4 @@
-//! A checkpoint's tensors by name; what is missing, misshapen or left over is an error.
+//! A checkpoint's tensors by name. Missing, misshapen or unused tensors are errors.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -9,31 +9,32 @@ use serde::Deserialize;
 
 use crate::kernels::backend::Backend;
 
-/// Endings of names in a vision tower that no output depends on, besides blocks that are never run.
+/// Name prefixes within a vision tower of tensors that affect no output, in addition to unused
+/// blocks.
 const DEAD_TOWER_PARTS: [&str; 2] = ["norm.", "attn_pool."];
 
-/// Tensors not yet taken by a layer.
+/// The tensors that no layer has taken yet.
 pub struct Weights {
     tensors: HashMap<String, Tensor>,
     device: Device,
-    /// How the layers made of these weights compute.
+    /// The backend of the layers made of these weights.
     pub backend: Backend,
 }
 
-/// A part of the checkpoint by the beginning of its names.
+/// All tensors whose names start with the same prefix.
 pub struct Part<'a> {
     weights: &'a mut Weights,
     name: String,
 }
 
-/// The file that says which shard holds which tensor, in checkpoints of several shards.
+/// The index of a sharded checkpoint: which shard holds which tensor.
 #[derive(Deserialize)]
 struct Index {
     weight_map: HashMap<String, String>,
 }
 
 impl Weights {
-    /// Reads all tensors of a checkpoint's files.
+    /// Loads all tensors of a checkpoint's files.
     pub fn load(files: &[PathBuf], device: &Device, backend: Backend) -> Result<Weights> {
         let mut tensors = HashMap::new();
         for file in files {
@@ -43,23 +44,27 @@ impl Weights {
         Ok(Weights { tensors, device: device.clone(), backend })
     }
 
-    /// The part of the checkpoint whose names begin with `name`.
+    /// The tensors whose names start with `name`.
     pub fn part(&mut self, name: &str) -> Part<'_> {
         Part { weights: self, name: name.to_string() }
     }
 
-    /// Drops weights of known dead parts and returns how many; any other left over is an error.
+    /// Returns the number of remaining tensors that are known to be unused; any other remaining
+    /// tensor is an error.
     pub fn finish(self, towers: &[(&str, usize)]) -> Result<usize> {
         let (dead, unexpected): (Vec<&String>, Vec<&String>) =
             self.tensors.keys().partition(|name| is_dead(name, towers));
         if let Some(name) = unexpected.iter().min() {
-            bail!("weights: {} unexpected, the first is {name}", unexpected.len());
+            bail!(
+                "weights: expected only known tensors, got {} others, such as {name}",
+                unexpected.len()
+            );
         }
         Ok(dead.len())
     }
 }
 
-/// The files of a checkpoint: one, or the shards that the index names.
+/// The weight files of a checkpoint: a single file, or the shards in the index.
 pub fn weight_files(directory: &Path) -> Result<Vec<PathBuf>> {
     let single = directory.join("model.safetensors");
     if single.exists() {
@@ -69,15 +74,16 @@ pub fn weight_files(directory: &Path) -> Result<Vec<PathBuf>> {
     let text = std::fs::read_to_string(&path).with_context(|| {
         format!("weights: expected {} or {}, got neither", single.display(), path.display())
     })?;
-    let index: Index = serde_json::from_str(&text)
-        .with_context(|| format!("cannot understand {}", path.display()))?;
+    let index: Index =
+        serde_json::from_str(&text).with_context(|| format!("cannot parse {}", path.display()))?;
     let mut names: Vec<&String> = index.weight_map.values().collect();
     names.sort();
     names.dedup();
     Ok(names.into_iter().map(|name| directory.join(name)).collect())
 }
 
-/// Whether no output depends on a tensor; `towers` are names of vision towers with the number of blocks that are run.
+/// Whether a tensor affects no output; `towers` are the vision towers' names with their numbers of
+/// used blocks.
 pub fn is_dead(name: &str, towers: &[(&str, usize)]) -> bool {
     towers.iter().any(|(tower, blocks_used)| {
         let Some(rest) = name.strip_prefix(tower).and_then(|rest| rest.strip_prefix('.')) else {
@@ -92,16 +98,16 @@ pub fn is_dead(name: &str, towers: &[(&str, usize)]) -> bool {
 }
 
 impl Part<'_> {
-    /// The part of this part whose names go on with `name`.
+    /// The tensors of this part whose names continue with `name`.
     pub fn part(&mut self, name: &str) -> Part<'_> {
         Part { name: self.full_name(name), weights: self.weights }
     }
 
-    /// Takes a tensor out as f32; its shape must be as given.
+    /// Removes a tensor and returns it as f32; its shape must be `shape`.
     pub fn take(&mut self, name: &str, shape: &[usize]) -> Result<Tensor> {
         let name = self.full_name(name);
         let Some(tensor) = self.weights.tensors.remove(&name) else {
-            bail!("weights: {name} is missing, expected shape {shape:?}");
+            bail!("weights: expected {name} of shape {shape:?}, got none");
         };
         ensure!(tensor.dims() == shape, "{name}: expected {shape:?}, got {:?}", tensor.dims());
         let kind = tensor.dtype();
@@ -112,12 +118,12 @@ impl Part<'_> {
         Ok(tensor.to_dtype(DType::F32)?)
     }
 
-    /// How the layers made of these weights compute.
+    /// The backend of the layers made of these weights.
     pub fn backend(&self) -> Backend {
         self.weights.backend
     }
 
-    /// Where the tensors are.
+    /// The device of the tensors.
     pub fn device(&self) -> Device {
         self.weights.device.clone()
     }

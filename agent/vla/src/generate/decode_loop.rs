@@ -1,6 +1,6 @@
-//! The decode loop: one prefill per session, then one token at a time for all candidates together.
+//! The decode loop: one prefill per session, then one token per step for all candidates together.
 //!
-//! Candidates of a session that have drawn the same tokens so far share their rows of work.
+//! Candidates of a session with the same tokens so far share one row of the batch.
 
 use std::collections::HashMap;
 
@@ -13,7 +13,7 @@ use crate::checkpoint::parse::is_complete;
 use crate::generate::sampling::{Draw, Stream, draw};
 use crate::network::forward::{Context, Network};
 
-/// Positions of a tail to make room for at once; tails grow beyond it when they must.
+/// Initial capacity of a tail, in positions; tails grow if necessary.
 const TAIL_CAPACITY: usize = 64;
 
 /// One session's prompt and how to continue it.
@@ -22,43 +22,44 @@ pub struct Continuation<'a> {
     pub candidates: usize,
     pub temperature: f32,
     pub seed: u64,
-    /// A completion that has not ended by then is cut, one token later.
+    /// Maximum length of a completion; a longer one is cut after one more token.
     pub tokens_max: usize,
 }
 
-/// When a completion ends.
+/// The conditions under which a completion ends.
 pub struct Limits<'a> {
     pub bins: &'a ActionBins,
-    /// Ids from here on are padding of the embedding and are never drawn.
+    /// Ids from here on are padding of the embedding and are never sampled.
     pub vocabulary: usize,
     pub end: u32,
 }
 
-/// A completion under way or done.
+/// A completion that is finished or in progress.
 pub struct Completion {
     pub session: usize,
     /// Without `</s>`.
     pub tokens: Vec<u32>,
     pub log_probability: f64,
-    /// Of each token.
+    /// Log-probability of each token.
     pub log_probabilities: Vec<f32>,
-    /// Of the last token.
+    /// Hidden state of the last token.
     pub hidden: Vec<f32>,
     temperature: f32,
     stream: Stream,
     tokens_max: usize,
-    /// The row that computes it; several completions of a session share one while they agree.
+    /// The row that computes this completion. Completions of a session share a row as long as they
+    /// agree.
     row: Option<usize>,
 }
 
-/// A row to be computed next: one more token onto an earlier row.
+/// A row of the next step: an earlier row extended by one token.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 struct Row {
     parent: usize,
     token: u32,
 }
 
-/// All completions, session by session and candidate by candidate.
+/// All completions, ordered by session and then by candidate.
 pub fn complete(
     network: &Network,
     sessions: &[Continuation<'_>],
@@ -69,7 +70,7 @@ pub fn complete(
     let decoder = &network.decoder;
     let mut completions = start(sessions);
     let mut rows = extend(&mut completions, &hidden, &decoder.logits(&hidden)?, limits)?;
-    // At first a row's parent is its session itself.
+    // In the first step, a row's parent is its session.
     let parents: Vec<usize> = rows.iter().map(|row| row.parent).collect();
     let mut tail = decoder.tails(parents, TAIL_CAPACITY);
     while !rows.is_empty() {
@@ -102,7 +103,8 @@ fn start(sessions: &[Continuation<'_>]) -> Vec<Completion> {
     completions.collect()
 }
 
-/// Draws the next token of every completion under way; the rows that must be computed for them.
+/// Samples the next token of every unfinished completion; returns the rows that must be computed
+/// next.
 fn extend(
     completions: &mut [Completion],
     hidden: &Tensor,
@@ -118,7 +120,7 @@ fn extend(
         Ok(token.map(|token| Row { parent: row, token }))
     });
     let next = next.collect::<Result<Vec<Option<Row>>>>()?;
-    // Completions of one session that agree so far are computed once.
+    // Completions of one session with equal tokens so far are computed once.
     let (mut rows, mut known) = (Vec::new(), HashMap::new());
     for (completion, next) in completions.iter_mut().zip(next) {
         completion.row = next.map(|row| {
@@ -132,7 +134,7 @@ fn extend(
 }
 
 impl Completion {
-    /// The next token, or none when the completion is done.
+    /// The next token, or `None` when the completion is finished.
     fn draw(&mut self, logits: &[f32], limits: &Limits<'_>) -> Result<Option<u32>> {
         let Draw { token, log_probability } =
             draw(logits, self.temperature, self.stream.uniform())?;

@@ -1,4 +1,4 @@
-//! Tokens: the decode loop, its draws, how long it takes.
+//! Token generation: the decode loop, sampling, timing.
 
 pub mod decode_loop;
 pub mod sampling;

@@ -1,11 +1,11 @@
-//! Drawing tokens: seeded, reproducible, and each candidate from a stream of its own.
+//! Reproducible token sampling: each candidate has its own seeded random stream.
 
 use anyhow::{Result, ensure};
 
 use crate::kernels::activation::exponential;
 use crate::kernels::backend::vectorised;
 
-/// Random numbers of one candidate: a pure function of seed, candidate and position.
+/// The random numbers of one candidate: a pure function of seed, candidate and position.
 #[derive(Clone, Debug)]
 pub struct Stream {
     state: u64,
@@ -18,7 +18,7 @@ pub struct Draw {
     pub log_probability: f64,
 }
 
-/// SplitMix64's increment: the odd number nearest to 2^64 over the golden ratio.
+/// SplitMix64's increment: the odd number nearest to 2^64 / golden ratio.
 const STEP: u64 = 0x9E37_79B9_7F4A_7C15;
 
 impl Stream {
@@ -41,9 +41,10 @@ fn mix(mut bits: u64) -> u64 {
     bits ^ (bits >> 31)
 }
 
-/// Draws a token from softmax(logits / temperature) at the share `uniform` of its cumulated weights.
+/// Samples a token from softmax(logits / temperature) by inverting its cumulative distribution at
+/// `uniform`.
 ///
-/// At temperature 0 it is the first of the largest logits. Weights are f32, their sums f64.
+/// Temperature 0 selects the first of the largest logits. Weights are f32, their sums f64.
 pub fn draw(logits: &[f32], temperature: f32, uniform: f64) -> Result<Draw> {
     let (best, largest) = argmax(logits);
     ensure!(largest.is_finite(), "logits: expected finite numbers, got {largest}");
@@ -63,7 +64,7 @@ pub fn draw(logits: &[f32], temperature: f32, uniform: f64) -> Result<Draw> {
     Ok(Draw { token: token as u32, log_probability })
 }
 
-/// The first of the largest logits, or the first that is no number.
+/// The first of the largest logits, or the first NaN.
 fn argmax(logits: &[f32]) -> (usize, f32) {
     let mut best = 0;
     for (index, &logit) in logits.iter().enumerate() {
@@ -87,7 +88,7 @@ fn soften(logits: &[f32], largest: f32, scale: f32, weights: &mut [f32]) -> f64 
     for (weight, &logit) in weights.iter_mut().zip(logits) {
         *weight = exponential((logit - largest) * scale);
     }
-    // Eight sums side by side, in a fixed order.
+    // Eight partial sums in a fixed order.
     let mut sums = [0.0f64; 8];
     let chunks = weights.chunks_exact(8);
     let rest: f64 = chunks.remainder().iter().copied().map(f64::from).sum();
@@ -153,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn logits_that_are_no_numbers_are_refused() {
+    fn logits_that_are_not_finite_are_refused() {
         for bad in [f32::NAN, f32::INFINITY] {
             assert!(draw(&[0.0, bad, 1.0], 1.0, 0.5).is_err());
         }

@@ -1,4 +1,4 @@
-//! How long the parts of a decision take, apart from what the tokens say.
+//! Times of the parts of a decision, independent of the generated tokens.
 
 use std::time::Instant;
 
@@ -6,23 +6,23 @@ use anyhow::Result;
 
 use crate::network::forward::{Context, Network};
 
-/// Milliseconds of one decision's parts.
+/// Times of the parts of one decision, in milliseconds.
 #[derive(Debug, Clone, Copy)]
 pub struct Timings {
-    /// Image, prompt and the first logits of every session.
+    /// Image, prompt and first logits of all sessions.
     pub prefill_ms: f64,
-    /// One token of every candidate, with its logits; the mean over all steps.
+    /// One token of every candidate with its logits; the mean over all steps.
     pub step_ms: f64,
 }
 
-/// Runs every context with so many candidates each, for so many tokens, whatever they are.
+/// Runs every context with this number of candidates and tokens.
 pub fn measure(
     network: &Network,
     contexts: &[Context<'_>],
     candidates: usize,
     tokens: usize,
 ) -> Result<Timings> {
-    // As `Lanes::complete` runs one lane.
+    // As in `WorkerPools::complete` without dividing the sessions.
     rayon::scope(|_| measure_inside(network, contexts, candidates, tokens))
 }
 
@@ -34,7 +34,7 @@ fn measure_inside(
 ) -> Result<Timings> {
     let start = Instant::now();
     let (prefix, hidden) = network.prefill_all(contexts)?;
-    // A graphics card works on after the call has returned.
+    // A GPU may still be computing after the call has returned.
     network.decoder.logits(&hidden)?.device().synchronize()?;
     let prefill_ms = start.elapsed().as_secs_f64() * 1e3;
     let sessions: Vec<usize> =

@@ -1,8 +1,10 @@
-//! Worker pools of one thread, each with requests of its own, instead of all threads on each product.
+//! Worker pools of one thread each. Each pool decodes its own requests, so that threads do not
+//! share a matrix product.
 //!
-//! A step of the decode loop is dozens of small products. Divided among threads, each of them ends with the threads
-//! waiting for each other; divided by session, they wait once per decision, and divided by call, never. The bits are the
-//! same: a row's result does not depend on the rows beside it.
+//! A decode step consists of dozens of small products. If threads share each product, they
+//! synchronise after each one. If they divide the sessions, they synchronise once per decision; if
+//! they divide the calls, never. The results are bitwise equal, because a row's result does not
+//! depend on other rows.
 
 use std::sync::{Mutex, PoisonError};
 use std::thread;
@@ -17,23 +19,23 @@ use crate::network::forward::Network;
 /// Minimum batch of a pool: below it, re-reading the weights dominates.
 const POOL_CANDIDATES_MIN: usize = 8;
 
-/// One pool of a single thread per processor.
+/// One single-threaded pool per core.
 pub struct WorkerPools {
     pools: Vec<ThreadPool>,
-    /// Calls that use each pool now.
+    /// Number of calls that currently use each pool.
     calls: Mutex<Vec<usize>>,
 }
 
-/// The pools of one call, until it is dropped.
+/// The pools reserved by one call, released on drop.
 struct Reserved<'a> {
     pools: Vec<usize>,
-    /// All threads work on each product, and none in its pool.
+    /// The call uses all threads for each product instead of single-threaded pools.
     is_undivided: bool,
     of: &'a WorkerPools,
 }
 
 impl WorkerPools {
-    /// Pools for kernels on the processor; none where a device computes.
+    /// Pools for the CPU kernels; none if a GPU computes.
     pub fn new(backend: Backend) -> Result<WorkerPools> {
         let count = match backend {
             Backend::Kernels => rayon::current_num_threads(),
@@ -45,13 +47,13 @@ impl WorkerPools {
         Ok(WorkerPools { pools, calls: Mutex::new(vec![0; count]) })
     }
 
-    /// Pools that there are.
+    /// Number of pools.
     pub fn count(&self) -> usize {
         self.pools.len()
     }
 
-    /// All completions, session by session and candidate by candidate. A call that finds others computing takes the pool
-    /// that is used least; alone it takes as many as its batch pays for.
+    /// All completions, ordered by session and then by candidate. If other calls are running, the
+    /// call uses the least used pool; otherwise it uses as many pools as its batch size justifies.
     pub fn complete(
         &self,
         network: &Network,
@@ -62,7 +64,8 @@ impl WorkerPools {
         let wanted = (candidates / POOL_CANDIDATES_MIN).min(sessions.len());
         let reserved = self.reserve(wanted.min(rayon::current_num_threads()));
         if reserved.is_undivided {
-            // From outside of its pool, each of a step's dozens of products would wake a thread and wait for it.
+            // Called from outside the thread pool, each of the many products would wake a thread
+            // and wait for it.
             return rayon::scope(|_| complete(network, sessions, limits));
         }
         let count = reserved.pools.len();

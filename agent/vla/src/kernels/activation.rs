@@ -1,11 +1,12 @@
-//! Activations of rows: the exact (erf) GELU of the vision side and the gated SiLU of the decoder.
+//! Row-wise activations: the exact (erf) GELU of the vision towers and the gated SiLU of the
+//! decoder.
 
 use candle_core::{Result, Tensor};
 use rayon::prelude::*;
 
 use crate::kernels::backend::{Backend, Values, vectorised};
 
-/// Numbers per task: enough work to be worth another thread.
+/// Elements per task: enough work to justify another thread.
 const TASK_LENGTH: usize = 1 << 14;
 
 /// x / 2 x (1 + erf(x / sqrt 2)).
@@ -25,7 +26,8 @@ pub fn gelu(rows: &Tensor, backend: Backend) -> Result<Tensor> {
     }
 }
 
-/// silu(gate) x up, where a row holds all gates and then all ups: (n, 2 x width) -> (n, width).
+/// silu(gate) x up, where a row contains all gates followed by all ups: (n, 2 x width) -> (n,
+/// width).
 pub fn gated_silu(rows: &Tensor, backend: Backend) -> Result<Tensor> {
     let (count, double) = rows.dims2()?;
     let width = double / 2;
@@ -72,7 +74,7 @@ fn gated_silu_rows(input: &[f32], output: &mut [f32], width: usize) {
     }
 }
 
-/// erf by Abramowitz and Stegun 7.1.26: at most 1.5e-7 off, and free of branches.
+/// erf by Abramowitz and Stegun 7.1.26, without branches; the error is at most 1.5e-7.
 #[inline(always)]
 fn error_function(x: f32) -> f32 {
     let size = x.abs();
@@ -86,12 +88,12 @@ fn error_function(x: f32) -> f32 {
     (1.0 - polynomial * exponential(-size * size)).copysign(x)
 }
 
-/// e to the x within two units in the last place, free of branches; 0 below -87, inf-free above 88.
+/// e^x within two units in the last place, without branches; 0 below -87, finite above 88.
 #[inline(always)]
 pub fn exponential(x: f32) -> f32 {
     // x = n ln 2 + r with |r| <= ln 2 / 2; ln 2 in two parts keeps r exact (Cody and Waite).
     let x = x.clamp(-87.3, 88.0);
-    // Adding 1.5 x 2^23 rounds to the nearest integer, which then sits in the low bits.
+    // Adding 1.5 x 2^23 rounds to the nearest integer, which is then in the low bits.
     const ROUND: f32 = 12_582_912.0;
     let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUND);
     let n = shifted - ROUND;

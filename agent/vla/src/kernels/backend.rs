@@ -1,26 +1,26 @@
-//! Which arithmetic runs: our kernels over slices of the CPU, or candle's operations on any device.
+//! The arithmetic backends: our kernels on CPU slices, or candle's operations on any device.
 
 use std::ops::{Deref, Range};
 
 use candle_core::{Device, Result, Storage, StorageRef, Tensor, bail};
 
-/// How layers compute; chosen once when weights are loaded.
+/// How layers compute; selected when weights are loaded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Backend {
     /// Packed weights and fused loops over f32 slices. A row's bits do not depend on other rows.
     Kernels,
-    /// candle's own operations: any device, and the reference that the kernels are tested against.
+    /// candle's operations: for any device, and as the reference of the kernels' tests.
     Tensors,
 }
 
 impl Backend {
-    /// The faster of the two for a device.
+    /// The faster backend of a device.
     pub fn for_device(device: &Device) -> Backend {
         if device.is_cpu() { Backend::Kernels } else { Backend::Tensors }
     }
 }
 
-/// The numbers of a contiguous f32 tensor on the CPU, readable as a slice.
+/// The values of a contiguous f32 tensor on the CPU, as a slice.
 pub struct Values<'a> {
     storage: StorageRef<'a>,
     range: Range<usize>,
@@ -57,12 +57,12 @@ impl Deref for Values<'_> {
     }
 }
 
-/// Defines a function that runs another one compiled for 8-wide vectors and fused multiply-add, if
-/// this processor has them, and as it is otherwise.
+/// Defines a function that runs another one compiled for AVX2 and fused multiply-add if the
+/// processor supports them, and as it is otherwise.
 ///
-/// Results do not depend on the choice: every sum is written with `mul_add` in a fixed order. The
-/// other function must be `#[inline(always)]`, or it is not compiled anew; a closure cannot promise
-/// that, and without it every `mul_add` becomes a slow call.
+/// The result is the same in both cases, because every sum uses `mul_add` in a fixed order. The
+/// other function must be `#[inline(always)]`, otherwise it is not recompiled for these features
+/// and every `mul_add` becomes a slow call. A closure cannot be marked so.
 macro_rules! vectorised {
     (fn $name:ident($($argument:ident: $kind:ty),* $(,)?) $(-> $result:ty)? = $body:path;) => {
         fn $name($($argument: $kind),*) $(-> $result)? {

@@ -1,4 +1,4 @@
-//! Which device a policy computes on, by its name on the command line.
+//! The device of a policy, named as on the command line.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,23 +6,23 @@ use std::str::FromStr;
 use anyhow::{Context as _, Result, ensure};
 use candle_core::Device;
 
-/// `cpu`, `cuda` (the first graphics card) or `cuda:N`.
+/// `cpu`, `cuda` (the first GPU) or `cuda:N`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DeviceName {
-    /// This machine's processors.
+    /// The CPU.
     #[default]
     Cpu,
-    /// One graphics card, counted from 0; only in a program built with the feature `cuda`.
+    /// A GPU, numbered from 0; only in a program built with the feature `cuda`.
     Cuda(usize),
 }
 
 impl DeviceName {
-    /// Opens the device; an error says how to build a program that has it.
+    /// Opens the device. The error for a missing feature says how to build with it.
     pub fn open(self) -> Result<Device> {
         let DeviceName::Cuda(index) = self else { return Ok(Device::Cpu) };
         ensure!(
             cfg!(feature = "cuda"),
-            "device {self}: this rever computes on the cpu alone; build it with `cargo build --release --features cuda`"
+            "device {self}: this build of rever supports only cpu; rebuild it with `cargo build --release --features cuda`"
         );
         Device::new_cuda(index).with_context(|| format!("cannot open the device {self}"))
     }
@@ -68,7 +68,7 @@ mod tests {
 
     #[cfg(not(feature = "cuda"))]
     #[test]
-    fn a_program_without_cuda_says_how_to_get_one() {
+    fn a_build_without_cuda_says_how_to_enable_it() {
         let error = DeviceName::Cuda(1).open().expect_err("no such device");
         let text = format!("{error:#}");
         assert!(text.contains("cuda:1") && text.contains("--features cuda"), "{text}");

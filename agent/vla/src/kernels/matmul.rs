@@ -1,7 +1,7 @@
-//! The product of activation rows with a packed weight; a row's bits do not depend on other rows.
+//! The product of activation rows with a packed weight. A row's bits do not depend on other rows.
 //!
-//! Every output is one chain of fused multiply-adds over the inputs in order, whatever tile
-//! computes it. So one row, sixteen sessions and any number of threads give the same bits.
+//! Every output is one chain of fused multiply-adds over the inputs in order, in every tile. The
+//! results are therefore bitwise equal for any number of rows, sessions and threads.
 
 use std::ops::Range;
 
@@ -10,9 +10,9 @@ use rayon::prelude::*;
 
 use crate::kernels::tile::{self, PANEL, Stored, Vectors};
 
-/// Rows per task: with 256 inputs they stay in the second-level cache while panels stream by.
+/// Rows per task: with 256 inputs they stay in the L2 cache while the panels are streamed.
 const TASK_ROWS: usize = 96;
-/// Multiply-adds per task below which another thread costs more than it brings.
+/// Minimum number of multiply-adds per task; with fewer, another thread costs more than it gains.
 const TASK_WORK_MIN: usize = 1 << 17;
 
 /// A weight of `outputs` x `inputs` stored in panels of sixteen outputs, input by input.
@@ -22,14 +22,14 @@ pub struct PackedWeight {
     panels: Panels,
 }
 
-/// Numbers in the fewest bits that keep every one of them.
+/// The weights in the smallest format that represents all of them exactly.
 enum Panels {
     Half(Vec<bf16>),
     Full(Vec<f32>),
 }
 
 impl PackedWeight {
-    /// Packs a row-major weight as checkpoints store it: one row per output.
+    /// Packs a row-major weight in the layout of checkpoints: one row per output.
     pub fn pack(weight: &[f32], outputs: usize, inputs: usize) -> PackedWeight {
         assert_eq!(weight.len(), outputs * inputs, "weight of {outputs} x {inputs}");
         let is_half = weight.iter().all(|&value| bf16::from_f32(value).to_f32() == value);
@@ -41,12 +41,12 @@ impl PackedWeight {
         PackedWeight { outputs, inputs, panels }
     }
 
-    /// Outputs per row.
+    /// Number of outputs per row.
     pub fn outputs(&self) -> usize {
         self.outputs
     }
 
-    /// Bytes of the panels.
+    /// Size of the panels in bytes.
     pub fn bytes(&self) -> usize {
         match &self.panels {
             Panels::Half(panels) => size_of_val(panels.as_slice()),
@@ -83,13 +83,13 @@ impl PackedWeight {
             Panels::Half(panels) => Product { inputs, panels, rows, target }.run(vectors, count),
             Panels::Full(panels) => Product { inputs, panels, rows, target }.run(vectors, count),
         }
-        // SAFETY: the tasks of `run` cover every row and every panel, so all numbers are written.
+        // SAFETY: the tasks of `run` cover every row and every panel, so all elements are written.
         unsafe { output.set_len(length) };
         output
     }
 }
 
-/// Panel after panel; the last one is filled up with zeros.
+/// All panels in order; the last one is padded with zeros.
 fn panels<W: Stored>(
     weight: &[f32],
     outputs: usize,
@@ -106,7 +106,7 @@ fn panels<W: Stored>(
     panels
 }
 
-/// One product under way.
+/// A product in progress.
 pub struct Product<'a, W> {
     inputs: usize,
     panels: &'a [W],
@@ -114,7 +114,7 @@ pub struct Product<'a, W> {
     target: Output<'a>,
 }
 
-/// Where tiles are written, and what is added there; tasks own disjoint rectangles of it.
+/// The output of the tiles and the terms added to it; each task writes its own rectangle.
 struct Output<'a> {
     start: *mut f32,
     outputs: usize,
@@ -122,7 +122,7 @@ struct Output<'a> {
     residual: Option<&'a [f32]>,
 }
 
-// SAFETY: no two tasks write the same number, and nobody reads before all are done.
+// SAFETY: no two tasks write the same element, and nothing reads before all are done.
 unsafe impl Send for Output<'_> {}
 // SAFETY: as above.
 unsafe impl Sync for Output<'_> {}
@@ -150,24 +150,24 @@ impl<W: Stored> Product<'_, W> {
         }
     }
 
-    /// Inputs per row.
+    /// Number of inputs per row.
     pub fn inputs(&self) -> usize {
         self.inputs
     }
 
-    /// Weights of one panel: `inputs` chunks of sixteen.
+    /// The weights of one panel: for each input, sixteen outputs.
     #[inline(always)]
     pub fn panel(&self, panel: usize) -> &[W] {
         &self.panels[panel * PANEL * self.inputs..(panel + 1) * PANEL * self.inputs]
     }
 
-    /// Some rows, one after another.
+    /// The given rows.
     #[inline(always)]
     pub fn rows(&self, rows: Range<usize>) -> &[f32] {
         &self.rows[rows.start * self.inputs..rows.end * self.inputs]
     }
 
-    /// Writes what a row and a panel came to.
+    /// Stores the sums of one row in one panel, plus bias and residual.
     #[inline(always)]
     pub fn store(&self, row: usize, panel: usize, mut sums: [f32; PANEL]) {
         let Output { start, outputs, bias, residual } = self.target;
@@ -184,12 +184,12 @@ impl<W: Stored> Product<'_, W> {
                 *sum += residual;
             }
         }
-        // SAFETY: `at + width` lies within the row, and this task alone owns the rectangle.
+        // SAFETY: `at + width` lies within the row, and only this task writes this rectangle.
         unsafe { std::ptr::copy_nonoverlapping(sums.as_ptr(), start.add(at), width) };
     }
 }
 
-/// The `index`th of `parts` nearly equal parts of `0..length`.
+/// Part number `index` of `parts` nearly equal parts of `0..length`.
 #[inline(always)]
 pub fn even_part(length: usize, parts: usize, index: usize) -> Range<usize> {
     index * length / parts..(index + 1) * length / parts
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn products_equal_plain_sums_at_every_shape() {
+    fn products_equal_reference_sums_for_every_shape() {
         let shapes = [(1, 3, 5), (7, 64, 16), (8, 20, 47), (9, 5, 16), (10, 7, 64), (13, 33, 50)];
         for (count, inputs, outputs) in shapes.into_iter().chain([(200, 48, 130)]) {
             let (weight, rows) = (numbers(outputs * inputs, 1), numbers(count * inputs, 2));
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_does_not_depend_on_its_neighbours() {
+    fn a_row_does_not_depend_on_other_rows() {
         let (inputs, outputs) = (300, 200);
         let packed = PackedWeight::pack(&numbers(outputs * inputs, 5), outputs, inputs);
         let rows = numbers(250 * inputs, 6);

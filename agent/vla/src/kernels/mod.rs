@@ -1,4 +1,4 @@
-//! What the layers are made of: products, attention over segments, norms, activations, on a processor or a device.
+//! The kernels of the layers: products, attention over segments, norms, activations, on CPU or GPU.
 
 pub mod activation;
 pub mod backend;

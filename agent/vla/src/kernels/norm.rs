@@ -1,13 +1,14 @@
-//! Normalisation of rows: layer norm for the vision towers, root mean square for the decoder.
+//! Row-wise normalisation: layer norm for the vision towers, RMS norm for the decoder.
 
 use candle_core::{D, Result, Tensor};
 use rayon::prelude::*;
 
 use crate::kernels::backend::{Backend, Values, vectorised};
 
-/// Partial sums per row: eight, added in a fixed order, as one vector register holds.
+/// Number of partial sums per row, as many as a vector register holds. They are added in a fixed
+/// order.
 const LANES: usize = 8;
-/// Rows per task; a row costs less than a task's start.
+/// Rows per task; a single row costs less than starting a task.
 const TASK_ROWS: usize = 32;
 
 /// (x - mean) / sqrt(variance + epsilon) x weight + bias, over each row.

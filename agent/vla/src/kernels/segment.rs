@@ -1,7 +1,7 @@
-//! Keys and values of a run of positions, laid out for one query row at a time.
+//! Keys and values of consecutive positions, in the layout for one query row at a time.
 //!
-//! Keys stand in blocks of eight positions, dimension by dimension, so that eight scores grow side
-//! by side in one vector register and no register has to be summed across.
+//! Keys are stored in blocks of eight positions, dimension by dimension. Eight scores are
+//! accumulated in one vector register, without a horizontal sum.
 
 use crate::kernels::activation::exponential;
 use crate::kernels::backend::vectorised;
@@ -9,7 +9,7 @@ use crate::network::rotary::HeadShape;
 
 /// Positions per block of keys.
 const BLOCK: usize = 8;
-/// Chains of sums per score, to hide the latency of multiply-add.
+/// Independent sums per score, to hide the latency of multiply-add.
 const CHAINS: usize = 4;
 
 /// Keys and values of consecutive positions; grows by `push`.
@@ -28,7 +28,7 @@ struct Head {
 }
 
 impl Segment {
-    /// An empty segment with room for `capacity` positions.
+    /// An empty segment with capacity for `capacity` positions.
     pub fn new(shape: HeadShape, capacity: usize) -> Segment {
         let head = || Head {
             keys: Vec::with_capacity(capacity.div_ceil(BLOCK) * BLOCK * shape.size),
@@ -37,12 +37,12 @@ impl Segment {
         Segment { heads: (0..shape.key_value_heads).map(|_| head()).collect(), length: 0 }
     }
 
-    /// Positions held.
+    /// Number of positions.
     pub fn length(&self) -> usize {
         self.length
     }
 
-    /// Appends one position: a row of keys and a row of values, head after head.
+    /// Appends one position: a row of keys and a row of values, one head after the other.
     pub fn push(&mut self, key: &[f32], value: &[f32]) {
         let size = key.len() / self.heads.len();
         let lane = self.length % BLOCK;
@@ -62,7 +62,7 @@ impl Segment {
     }
 }
 
-/// The first `count` positions of a segment, as a query may see only some of them.
+/// The first `count` positions of a segment: those that a query may attend to.
 #[derive(Clone, Copy)]
 pub struct Visible<'a> {
     pub segment: &'a Segment,
@@ -79,7 +79,7 @@ vectorised! {
     ) = attend_heads;
 }
 
-/// Attention of one row of queries over all that it sees; `scores` is scratch space.
+/// Attention of one row of queries over all visible positions; `scores` is scratch space.
 pub fn attend_row(
     query: &[f32],
     seen: &[Visible<'_>],
@@ -125,7 +125,7 @@ fn attend_heads(
     }
 }
 
-/// Products of the query with `count` keys, in whole blocks: up to seven numbers too many.
+/// Products of the query with `count` keys, in whole blocks: writes up to seven extra numbers.
 #[inline(always)]
 fn score(query: &[f32], keys: &[f32], count: usize, scores: &mut [f32]) {
     let size = query.len();
@@ -185,7 +185,7 @@ fn soften(scores: &mut [f32], scale: f32) -> f32 {
     sum
 }
 
-/// Adds the values, each times its weight, to `output`.
+/// Adds the weighted sum of the values to `output`.
 #[inline(always)]
 fn weigh(weights: &[f32], values: &[f32], output: &mut [f32]) {
     let size = output.len();

@@ -1,7 +1,7 @@
 //! The innermost loops of a product: up to six rows times a panel of sixteen outputs.
 //!
-//! Written with intrinsics, for every number of rows a function of its own: left to the compiler,
-//! some sizes become scalar code and others keep their sums in memory.
+//! They use intrinsics, with one function per number of rows. The compiler alone generates scalar
+//! code for some sizes and keeps the sums in memory for others.
 
 use std::ops::Range;
 
@@ -22,26 +22,28 @@ use std::arch::x86_64::{
 pub const PANEL: usize = 16;
 /// Rows per tile: 6 x 16 sums fill twelve of AVX2's sixteen vector registers.
 const ROWS_MAX: usize = 6;
-/// Panels per tile with AVX-512: twelve sums again, and each weight read once for six rows.
+/// Panels per tile with AVX-512: again twelve registers of sums, and each weight is read once for
+/// six rows.
 #[cfg(target_arch = "x86_64")]
 const WIDE_PANELS: usize = 2;
 
-/// What weights are stored as. Sixteen bits halve what a step of few rows waits for.
+/// The storage format of weights. With few rows, 16 bits halve the memory traffic that bounds a
+/// step.
 pub trait Stored: Copy + Send + Sync {
-    /// The number itself.
+    /// The number as f32.
     fn widen(self) -> f32;
 
-    /// Eight numbers.
+    /// Loads eight numbers.
     ///
     /// # Safety
-    /// The processor has AVX2, and eight numbers lie there.
+    /// The processor supports AVX2, and `from` points to eight numbers.
     #[cfg(target_arch = "x86_64")]
     unsafe fn load_eight(from: *const Self) -> __m256;
 
-    /// Sixteen numbers.
+    /// Loads sixteen numbers.
     ///
     /// # Safety
-    /// The processor has AVX-512, and sixteen numbers lie there.
+    /// The processor supports AVX-512, and `from` points to sixteen numbers.
     #[cfg(target_arch = "x86_64")]
     unsafe fn load_sixteen(from: *const Self) -> __m512;
 }
@@ -93,7 +95,7 @@ impl Stored for bf16 {
     }
 }
 
-/// Vectors that this processor has.
+/// A vector width that this processor supports.
 #[derive(Clone, Copy, Debug)]
 pub struct Vectors(Width);
 
@@ -103,12 +105,12 @@ enum Width {
     Sixteen,
     #[cfg(target_arch = "x86_64")]
     Eight,
-    /// Whatever the compiler makes of a loop.
+    /// Vectorised by the compiler.
     Plain,
 }
 
 impl Vectors {
-    /// The widest ones.
+    /// The widest vectors.
     pub fn widest() -> Vectors {
         #[cfg(target_arch = "x86_64")]
         {
@@ -122,7 +124,7 @@ impl Vectors {
         Vectors(Width::Plain)
     }
 
-    /// All of them, for tests: the bits must be the same.
+    /// All supported vectors, for tests: the results must be bitwise equal.
     #[cfg(test)]
     pub fn all() -> Vec<Vectors> {
         let mut all = vec![Vectors(Width::Plain), Vectors::widest()];
@@ -134,7 +136,7 @@ impl Vectors {
     }
 }
 
-/// All tiles of some rows and some panels.
+/// Computes all tiles of the given rows and panels.
 pub fn multiply<W: Stored>(
     vectors: Vectors,
     product: &Product<'_, W>,
@@ -142,7 +144,7 @@ pub fn multiply<W: Stored>(
     panels: Range<usize>,
 ) {
     match vectors.0 {
-        // SAFETY: nobody has these vectors without their feature having been detected.
+        // SAFETY: a value of this type exists only if the feature was detected.
         #[cfg(target_arch = "x86_64")]
         Width::Sixteen => unsafe { multiply_sixteen(product, rows, panels) },
         // SAFETY: as above.
@@ -211,13 +213,13 @@ fn tile_eight<W: Stored, const ROWS: usize>(product: &Product<'_, W>, first: usi
     let weights = product.panel(panel);
     let mut sums = [[_mm256_setzero_ps(); 2]; ROWS];
     for input in 0..inputs {
-        // SAFETY: a panel has `inputs` chunks of sixteen, and this function AVX2.
+        // SAFETY: a panel has `inputs` chunks of sixteen, and this function has AVX2.
         let (left, right) = unsafe {
             let weights = weights.as_ptr().add(input * PANEL);
             (W::load_eight(weights), W::load_eight(weights.add(PANEL / 2)))
         };
         for (row, sums) in sums.iter_mut().enumerate() {
-            // SAFETY: `rows` are ROWS times `inputs` numbers.
+            // SAFETY: `rows` has ROWS times `inputs` numbers.
             let value = _mm256_broadcast_ss(unsafe { rows.get_unchecked(row * inputs + input) });
             sums[0] = _mm256_fmadd_ps(value, left, sums[0]);
             sums[1] = _mm256_fmadd_ps(value, right, sums[1]);
@@ -225,7 +227,7 @@ fn tile_eight<W: Stored, const ROWS: usize>(product: &Product<'_, W>, first: usi
     }
     for (row, sums) in sums.into_iter().enumerate() {
         let mut numbers = [0.0f32; PANEL];
-        // SAFETY: sixteen numbers have room there.
+        // SAFETY: there is room for sixteen numbers.
         unsafe {
             _mm256_storeu_ps(numbers.as_mut_ptr(), sums[0]);
             _mm256_storeu_ps(numbers.as_mut_ptr().add(PANEL / 2), sums[1]);
@@ -244,7 +246,7 @@ fn multiply_sixteen<W: Stored>(product: &Product<'_, W>, rows: Range<usize>, pan
             if count == WIDE_PANELS {
                 with_rows!(part.len(), tile_sixteen, 2; product, part.start, panel);
             } else {
-                // The last of an odd number of panels, row by row: too seldom to matter.
+                // An odd number of panels: the last one is computed alone, which is rare.
                 part.for_each(|row| tile_sixteen::<W, 1, 1>(product, row, panel));
             }
         }
@@ -266,10 +268,10 @@ fn tile_sixteen<W: Stored, const ROWS: usize, const PANELS: usize>(
     let mut sums = [[_mm512_setzero_ps(); PANELS]; ROWS];
     for input in 0..inputs {
         for (index, weights) in weights.iter().enumerate() {
-            // SAFETY: a panel has `inputs` chunks of sixteen, and this function AVX-512.
+            // SAFETY: a panel has `inputs` chunks of sixteen, and this function has AVX-512.
             let weight = unsafe { W::load_sixteen(weights.as_ptr().add(input * PANEL)) };
             for (row, sums) in sums.iter_mut().enumerate() {
-                // SAFETY: `rows` are ROWS times `inputs` numbers.
+                // SAFETY: `rows` has ROWS times `inputs` numbers.
                 let value = _mm512_set1_ps(unsafe { *rows.get_unchecked(row * inputs + input) });
                 sums[index] = _mm512_fmadd_ps(value, weight, sums[index]);
             }
@@ -278,14 +280,14 @@ fn tile_sixteen<W: Stored, const ROWS: usize, const PANELS: usize>(
     for (row, sums) in sums.into_iter().enumerate() {
         for (index, sum) in sums.into_iter().enumerate() {
             let mut numbers = [0.0f32; PANEL];
-            // SAFETY: sixteen numbers have room there.
+            // SAFETY: there is room for sixteen numbers.
             unsafe { _mm512_storeu_ps(numbers.as_mut_ptr(), sum) };
             product.store(first + row, panel + index, numbers);
         }
     }
 }
 
-/// Rows in nearly equal parts of at most [`ROWS_MAX`].
+/// Splits rows into nearly equal parts of at most [`ROWS_MAX`].
 #[inline(always)]
 fn tiles(rows: Range<usize>) -> impl Iterator<Item = Range<usize>> {
     let count = rows.len().div_ceil(ROWS_MAX);

@@ -1,7 +1,8 @@
-//! Attention of query rows over keys and values: a prefix shared by rows, and a tail of each row.
+//! Attention of query rows over keys and values: a prefix shared by several rows, and a tail per
+//! row.
 //!
-//! Rows of all sessions stand one after another in one tensor; a range of rows belongs to one
-//! session (or one image), and attends to nothing else.
+//! The rows of all sessions are concatenated in one tensor. Each session (or image) is a range of
+//! rows and attends only to itself.
 
 use std::ops::Range;
 
@@ -15,7 +16,7 @@ use crate::network::rotary::HeadShape;
 /// Query rows per task: about 20 µs at the shipped model's size.
 const TASK_ROWS: usize = 4;
 
-/// One layer's keys and values of each session, read-only once made.
+/// The keys and values of each session in one layer; immutable.
 pub struct Prefix {
     form: PrefixForm,
     shape: HeadShape,
@@ -26,7 +27,7 @@ enum PrefixForm {
     Tensors(Vec<(Tensor, Tensor)>),
 }
 
-/// One layer's keys and values that each row has added after its session's prefix.
+/// The keys and values in one layer that each row has added after its session's prefix.
 pub struct Tail {
     form: TailForm,
     shape: HeadShape,
@@ -34,18 +35,18 @@ pub struct Tail {
 
 enum TailForm {
     Kernels(Vec<Segment>),
-    /// (rows, positions, key width), none before the first push.
+    /// (rows, positions, key width); `None` before the first push.
     Tensors(Option<(Tensor, Tensor)>),
 }
 
-/// Which query rows belong to which session.
+/// The query rows of a session.
 pub struct Group {
     pub session: usize,
     pub rows: Range<usize>,
 }
 
 impl Prefix {
-    /// Keys and values (rows, key width), of which each session owns a range of rows.
+    /// Makes prefixes of keys and values (rows, key width), where each session is a range of rows.
     pub fn new(
         key: &Tensor,
         value: &Tensor,
@@ -79,7 +80,7 @@ impl Prefix {
         Ok(Prefix { form, shape })
     }
 
-    /// The sessions of several prefixes as one.
+    /// Concatenates the sessions of several prefixes.
     pub fn join(parts: Vec<Prefix>) -> Option<Prefix> {
         let mut parts = parts.into_iter();
         let mut joined = parts.next()?;
@@ -93,9 +94,10 @@ impl Prefix {
         Some(joined)
     }
 
-    /// Attention of rows that are themselves the last positions of their session's prefix.
+    /// Attention of rows that are the last positions of their session's prefix.
     ///
-    /// With `causal`, a group's last row sees every position and each row before it one fewer.
+    /// With `causal`, a group's last row attends to all positions and each earlier row to one
+    /// fewer.
     pub fn attend(&self, query: &Tensor, groups: &[Group], causal: bool) -> Result<Tensor> {
         match &self.form {
             PrefixForm::Kernels(segments) => {
@@ -126,7 +128,7 @@ impl Prefix {
 }
 
 impl Tail {
-    /// Tails of `rows` rows, without positions yet.
+    /// Empty tails of `rows` rows.
     pub fn new(rows: usize, capacity: usize, shape: HeadShape, backend: Backend) -> Tail {
         let form = match backend {
             Backend::Kernels => TailForm::Kernels(vec![Segment::new(shape, capacity); rows]),
@@ -160,7 +162,7 @@ impl Tail {
         Ok(())
     }
 
-    /// Row i becomes a copy of row `parents[i]`; rows that are nobody's parent are dropped.
+    /// Row i becomes a copy of row `parents[i]`; rows that are not a parent are dropped.
     pub fn fork(&mut self, parents: &[usize]) -> Result<()> {
         match &mut self.form {
             TailForm::Kernels(segments) => {
@@ -168,7 +170,7 @@ impl Tail {
                 parents.iter().for_each(|&parent| children[parent] += 1);
                 let child = |&parent: &usize| {
                     children[parent] -= 1;
-                    // The last child takes what the others copy.
+                    // The last child takes the segment over, the others copy it.
                     match children[parent] {
                         0 => std::mem::take(&mut segments[parent]),
                         _ => segments[parent].clone(),
@@ -247,7 +249,8 @@ fn attend_tensors(
     let tail = |tensor: &Tensor| {
         let tensor = tensor.narrow(0, start, rows)?;
         let positions = tensor.dim(1)?;
-        // (rows, positions, key width) -> (rows x positions, key width) -> (heads, rows, positions, size)
+        // (rows, positions, key width) -> (rows x positions, key width)
+        // -> (heads, rows, positions, size)
         let flat = tensor.contiguous()?.flatten_to(1)?;
         shape.repeat(&flat)?.reshape((shape.heads, rows, positions, shape.size))
     };
@@ -264,7 +267,7 @@ fn attend_tensors(
 }
 
 impl HeadShape {
-    /// (positions, key width) -> (heads, positions, size), shared heads written out.
+    /// (positions, key width) -> (heads, positions, size), with shared heads repeated.
     fn repeat(self, x: &Tensor) -> Result<Tensor> {
         let x = by_head(x, self.key_value_heads, self.size)?;
         let positions = x.dim(1)?;
@@ -297,7 +300,7 @@ fn softmax(scores: &Tensor) -> Result<Tensor> {
     powers.broadcast_div(&powers.sum_keepdim(D::Minus1)?)
 }
 
-/// Minus infinity where a row would see a later position; the last row sees all.
+/// Minus infinity where a row must not attend to a later position; the last row attends to all.
 fn causal_mask(scores: &Tensor) -> Result<Tensor> {
     let (_, rows, positions) = scores.dims3()?;
     let hidden = |row: usize, position: usize| position + rows > positions + row;

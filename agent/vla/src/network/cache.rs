@@ -1,4 +1,4 @@
-//! What changes while a network runs: keys and values of prompts, and of what follows them.
+//! The caches of a network: keys and values of the prompts, and of the tokens after them.
 
 use anyhow::Result;
 use std::ops::Range;
@@ -7,13 +7,13 @@ use crate::kernels::backend::Backend;
 use crate::network::attention::{Group, Prefix, Tail};
 use crate::network::rotary::HeadShape;
 
-/// Keys and values of each session's image and prompt; read-only, shared by its candidates.
+/// The keys and values of each session's image and prompt; immutable and shared by its candidates.
 pub struct PrefixCache {
     pub(crate) layers: Vec<Prefix>,
     lengths: Vec<usize>,
 }
 
-/// Keys and values that each row has added; all have added equally many.
+/// The keys and values that each row has added; all rows have the same length.
 pub struct TailCache {
     pub(crate) layers: Vec<Tail>,
     sessions: Vec<usize>,
@@ -25,7 +25,7 @@ impl PrefixCache {
         PrefixCache { layers, lengths: sessions.iter().map(Range::len).collect() }
     }
 
-    /// The sessions of several caches as one.
+    /// Concatenates the sessions of several caches.
     pub(crate) fn join(parts: Vec<PrefixCache>) -> PrefixCache {
         let lengths = parts.iter().flat_map(|part| part.lengths.iter().copied()).collect();
         let mut layers: Vec<std::vec::IntoIter<Prefix>> =
@@ -36,7 +36,7 @@ impl PrefixCache {
 }
 
 impl TailCache {
-    /// Empty tails; `sessions` says which session each row continues, in rising order.
+    /// Empty tails; `sessions` is the session of each row, in ascending order.
     pub fn new(
         sessions: Vec<usize>,
         capacity: usize,
@@ -44,27 +44,27 @@ impl TailCache {
         shape: HeadShape,
         backend: Backend,
     ) -> TailCache {
-        assert!(sessions.is_sorted(), "rows of one session stand together");
+        assert!(sessions.is_sorted(), "rows of one session are adjacent");
         let layer = || Tail::new(sessions.len(), capacity, shape, backend);
         TailCache { layers: (0..layers).map(|_| layer()).collect(), sessions, length: 0 }
     }
 
-    /// Row i becomes a copy of row `parents[i]`; rows that are nobody's parent are dropped.
+    /// Row i becomes a copy of row `parents[i]`; rows that are not a parent are dropped.
     pub fn fork(&mut self, parents: &[usize]) -> Result<()> {
         self.sessions = parents.iter().map(|&parent| self.sessions[parent]).collect();
-        assert!(self.sessions.is_sorted(), "rows of one session stand together");
+        assert!(self.sessions.is_sorted(), "rows of one session are adjacent");
         for layer in &mut self.layers {
             layer.fork(parents)?;
         }
         Ok(())
     }
 
-    /// The position in its sequence that each row is about to add.
+    /// The next position of each row in its sequence.
     pub(crate) fn positions(&self, prefix: &PrefixCache) -> Vec<usize> {
         self.sessions.iter().map(|&session| prefix.lengths[session] + self.length).collect()
     }
 
-    /// Rows by session.
+    /// The rows of each session.
     pub(crate) fn groups(&self) -> Vec<Group> {
         let mut start = 0;
         let chunks = self.sessions.chunk_by(|a, b| a == b);

@@ -1,7 +1,8 @@
-//! The Llama decoder: embeddings in, hidden states after the final norm out.
+//! The Llama decoder: from embeddings to hidden states after the final norm.
 //!
-//! `prefill` runs the image and prompt of every session once and keeps their keys and values;
-//! `step` adds one token to every candidate. Rows of all sessions share each product with a weight.
+//! `prefill` computes the image and prompt of every session once and keeps their keys and values.
+//! `step` adds one token to every candidate. The rows of all sessions share each product with a
+//! weight.
 
 use std::ops::Range;
 
@@ -19,7 +20,7 @@ use crate::network::linear::Linear;
 use crate::network::rotary::{HeadShape, Rotary};
 use crate::network::trace::Trace;
 
-/// Token ids to hidden states to logits.
+/// From token ids to hidden states to logits.
 pub struct Decoder {
     embed_tokens: Tensor,
     layers: Vec<Layer>,
@@ -32,7 +33,7 @@ pub struct Decoder {
     device: Device,
 }
 
-/// One layer; queries, keys and values come of one product, gates and ups of another.
+/// One layer. One product computes queries, keys and values, another one gates and ups.
 struct Layer {
     input_layernorm: RmsNorm,
     query_key_value: Linear,
@@ -43,16 +44,16 @@ struct Layer {
     backend: Backend,
 }
 
-/// Positions whose hidden states are wanted of a prefill.
+/// The positions of a prefill whose hidden states are returned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wanted {
-    /// Each session's last; the last layer then skips all others, as nobody reads them.
+    /// The last position of each session; the last layer then skips all others.
     Last,
     All,
 }
 
 impl Decoder {
-    /// Takes the weights under `language_model`.
+    /// Loads the weights under `language_model`.
     pub fn load(mut weights: Part<'_>, config: &TextConfig) -> Result<Decoder> {
         let (hidden, vocabulary) = (config.hidden_size, config.vocab_size);
         let (backend, device) = (weights.backend(), weights.device());
@@ -81,12 +82,13 @@ impl Decoder {
         })
     }
 
-    /// Positions that a sequence may have.
+    /// Maximum length of a sequence.
     pub fn positions_max(&self) -> usize {
         self.positions_max
     }
 
-    /// Bytes of the products' weights that a step reads; embeddings and norms are a few kilobytes.
+    /// Bytes of the matrix weights that a step reads; embeddings and norms add only a few
+    /// kilobytes.
     pub fn step_bytes(&self) -> usize {
         let layer = |layer: &Layer| {
             let Layer { query_key_value, o_proj, gate_up, down_proj, .. } = layer;
@@ -98,13 +100,13 @@ impl Decoder {
         self.layers.iter().map(layer).sum::<usize>() + self.lm_head.bytes()
     }
 
-    /// Ids -> (ids, hidden)
+    /// Token ids -> (ids, hidden)
     pub fn embed(&self, ids: &[u32]) -> Result<Tensor> {
         let ids = Tensor::new(ids, &self.device)?;
         Ok(self.embed_tokens.index_select(&ids, 0)?)
     }
 
-    /// Runs whole sequences whose embeddings stand one after another in `rows`.
+    /// Computes whole sequences, whose embeddings are concatenated in `rows`.
     pub fn prefill(
         &self,
         rows: &Tensor,
@@ -143,17 +145,17 @@ impl Decoder {
         Ok((PrefixCache::new(prefixes, sessions), hidden))
     }
 
-    /// Empty tails for rows that continue the sessions listed, in rising order.
+    /// Empty tails; each row continues one of `sessions`, in ascending order.
     pub fn tails(&self, sessions: Vec<usize>, capacity: usize) -> TailCache {
         TailCache::new(sessions, capacity, self.layers.len(), self.shape, self.backend)
     }
 
-    /// Adds one token to every row of `tail`; (rows, hidden) after the final norm.
+    /// Adds one token to every row of `tail`; returns (rows, hidden) after the final norm.
     pub fn step(&self, ids: &[u32], prefix: &PrefixCache, tail: &mut TailCache) -> Result<Tensor> {
         let positions = tail.positions(prefix);
         ensure!(
             positions.iter().all(|&position| position < self.positions_max),
-            "candidate: expected at most {} positions, got one more",
+            "candidate: expected at most {} positions, got more",
             self.positions_max
         );
         let groups = tail.groups();
@@ -216,12 +218,12 @@ impl Layer {
         })
     }
 
-    /// (rows, hidden) -> (rows, queries and keys and values)
+    /// (rows, hidden) -> (rows, queries, keys and values)
     fn joined(&self, rows: &Tensor) -> candle_core::Result<Tensor> {
         self.query_key_value.forward(&self.input_layernorm.forward(rows)?)
     }
 
-    /// All that comes after attention.
+    /// The part of the layer after attention.
     fn finish(&self, rows: &Tensor, mixed: &Tensor) -> candle_core::Result<Tensor> {
         let rows = self.o_proj.forward_onto(rows, mixed)?;
         let gates = self.gate_up.forward(&self.post_attention_layernorm.forward(&rows)?)?;

@@ -1,4 +1,4 @@
-//! The whole network: image and prompt ids in, hidden states and logits out.
+//! The whole network: from image and prompt ids to hidden states and logits.
 
 use std::ops::Range;
 use std::path::Path;
@@ -17,7 +17,7 @@ use crate::network::projector::Projector;
 use crate::network::trace::Trace;
 use crate::network::vision::VisionBackbone;
 
-/// Sessions per task of a prefill: few enough that a layer's rows stay in the caches.
+/// Sessions per prefill task: few enough for a layer's rows to stay in the CPU caches.
 const TASK_SESSIONS: usize = 2;
 
 /// Vision towers, projector and decoder of one checkpoint.
@@ -25,11 +25,11 @@ pub struct Network {
     vision_backbone: VisionBackbone,
     projector: Projector,
     pub decoder: Decoder,
-    /// Weights in the file that no output depends on.
+    /// Number of weights in the file that affect no output.
     pub dead_weights: usize,
 }
 
-/// What a session asks the network to continue: the first id, the image, the other ids.
+/// The input of a session: the first id, the image, the other ids.
 #[derive(Clone, Copy)]
 pub struct Context<'a> {
     pub image: &'a Image,
@@ -37,7 +37,7 @@ pub struct Context<'a> {
 }
 
 impl Network {
-    /// Loads the weights of a checkpoint's folder.
+    /// Loads the weights from a checkpoint folder.
     pub fn load(
         directory: &Path,
         config: &Config,
@@ -58,7 +58,8 @@ impl Network {
         Ok(Network { vision_backbone, projector, decoder, dead_weights })
     }
 
-    /// Runs images and prompts of all sessions; last hidden states after the final norm.
+    /// Computes images and prompts of all sessions in parallel; returns the last hidden states
+    /// after the final norm.
     pub fn prefill_all(&self, contexts: &[Context<'_>]) -> Result<(PrefixCache, Tensor)> {
         let part = |contexts| self.prefill(contexts, Wanted::Last, &mut Trace::off());
         let parts = contexts.par_chunks(TASK_SESSIONS).map(part).collect::<Result<Vec<_>>>()?;
@@ -66,7 +67,8 @@ impl Network {
         Ok((PrefixCache::join(caches), Tensor::cat(&hidden, 0)?))
     }
 
-    /// Runs images and prompts together; hidden states after the final norm of the positions wanted.
+    /// Computes images and prompts in one batch; returns hidden states after the final norm at the
+    /// wanted positions.
     pub fn prefill(
         &self,
         contexts: &[Context<'_>],

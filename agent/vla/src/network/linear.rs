@@ -1,11 +1,11 @@
-//! A linear layer: rows (n, inputs) to rows (n, outputs), with an optional bias.
+//! A linear layer: rows (n, inputs) -> rows (n, outputs), with an optional bias.
 
 use candle_core::{Result, Tensor};
 
 use crate::kernels::backend::{Backend, Values};
 use crate::kernels::matmul::PackedWeight;
 
-/// A weight of (outputs, inputs) in the form its backend multiplies with.
+/// A weight of (outputs, inputs) in the format of its backend.
 pub struct Linear {
     form: Form,
     bias: Option<Tensor>,
@@ -17,7 +17,7 @@ enum Form {
 }
 
 impl Linear {
-    /// From a weight of (outputs, inputs), as checkpoints store it.
+    /// Makes a layer from a weight of (outputs, inputs), the layout of checkpoints.
     pub fn new(weight: &Tensor, bias: Option<Tensor>, backend: Backend) -> Result<Linear> {
         let weight = weight.contiguous()?;
         let form = match backend {
@@ -30,7 +30,7 @@ impl Linear {
         Ok(Linear { form, bias })
     }
 
-    /// Bytes of the weight.
+    /// Size of the weight in bytes.
     pub fn bytes(&self) -> usize {
         match &self.form {
             Form::Packed(weight) => weight.bytes(),

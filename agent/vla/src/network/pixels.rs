@@ -1,21 +1,22 @@
-//! Pixels as the vision towers want them: normalised, and cut into patches.
+//! Image preprocessing for the vision towers: normalisation and patches.
 
 use protocol::message::Image;
 
-/// Mean and deviation of each colour, in 0..1.
+/// Mean and standard deviation of each colour channel, for values in 0..1.
 pub struct Normalisation {
     pub mean: [f32; 3],
     pub deviation: [f32; 3],
 }
 
-/// ImageNet's values, which the DINO-like tower of a fused pair was trained with.
+/// ImageNet's values, for the DINO-like tower of a fused pair.
 pub const DINO: Normalisation =
     Normalisation { mean: [0.485, 0.456, 0.406], deviation: [0.229, 0.224, 0.225] };
 
-/// The values of every other tower.
+/// The values for all other towers.
 pub const SIGLIP: Normalisation = Normalisation { mean: [0.5; 3], deviation: [0.5; 3] };
 
-/// (images x side x side, 3 x patch x patch): each patch colour by colour, as convolutions store it.
+/// (images x side x side, 3 x patch x patch): each patch channel by channel, in the layout of
+/// convolution weights.
 pub fn patch_rows(
     images: &[&Image],
     side: usize,

@@ -1,4 +1,4 @@
-//! The projector: patch features to the decoder's width, by two layers, or three for fused towers.
+//! The projector from patch features to the decoder's width: two layers, or three for fused towers.
 
 use anyhow::Result;
 use candle_core::Tensor;
@@ -16,7 +16,7 @@ pub struct Projector {
 }
 
 impl Projector {
-    /// With fused towers the first layer is four times as wide as their features.
+    /// Loads the layers. With fused towers the first layer is four times as wide as the features.
     pub fn load(
         mut weights: Part<'_>,
         vision_width: usize,

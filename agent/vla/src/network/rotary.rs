@@ -1,35 +1,36 @@
-//! Rotary positions, half-split: the first half of a head turns against its second half.
+//! Rotary position embeddings, half-split: each element of a head's first half is paired with one
+//! of its second half.
 
 use candle_core::{Device, Result, Tensor};
 use rayon::prelude::*;
 
 use crate::kernels::backend::{Backend, Values, vectorised};
 
-/// Rows per task; a row costs less than a task's start.
+/// Rows per task; a single row costs less than starting a task.
 const TASK_ROWS: usize = 32;
 
-/// Heads of one attention layer.
+/// The heads of one attention layer.
 #[derive(Clone, Copy, Debug)]
 pub struct HeadShape {
     pub heads: usize,
-    /// Fewer than `heads` when several query heads share one key-value head.
+    /// Smaller than `heads` if several query heads share one key-value head.
     pub key_value_heads: usize,
     pub size: usize,
 }
 
 impl HeadShape {
-    /// Numbers in a row of queries.
+    /// Length of a row of queries.
     pub fn query_width(&self) -> usize {
         self.heads * self.size
     }
 
-    /// Numbers in a row of keys, or of values.
+    /// Length of a row of keys or of values.
     pub fn key_width(&self) -> usize {
         self.key_value_heads * self.size
     }
 }
 
-/// Cosines and sines of every position and frequency, (positions, head size / 2).
+/// Cosines and sines of every position and frequency: (positions, head size / 2).
 pub struct Rotary {
     cosines: Tensor,
     sines: Tensor,
@@ -38,7 +39,7 @@ pub struct Rotary {
 }
 
 impl Rotary {
-    /// Frequency i is theta^(-2 i / head size).
+    /// Computes the tables; frequency i is theta^(-2 i / head size).
     pub fn new(
         head_size: usize,
         positions_max: usize,
@@ -55,7 +56,8 @@ impl Rotary {
         Ok(Rotary { cosines: angles.cos()?, sines: angles.sin()?, half, backend })
     }
 
-    /// Splits rows of joined queries, keys and values and turns queries and keys to `positions`.
+    /// Splits joined rows into queries, keys and values, and rotates queries and keys to
+    /// `positions`.
     pub fn split(
         &self,
         joined: &Tensor,

@@ -1,7 +1,7 @@
-//! The vision backbone: one timm-style vision transformer, or two whose features are joined.
+//! The vision backbone: one timm-style vision transformer, or two whose features are concatenated.
 //!
-//! Features are the output of the second-to-last block, without final norm and prefix tokens.
-//! Rows of all images stand one after another: (images x tokens, width).
+//! Features are the output of the second-to-last block, without final norm and prefix tokens. The
+//! rows of all images are concatenated: (images x tokens, width).
 
 use std::ops::Range;
 
@@ -20,11 +20,11 @@ use crate::network::rotary::HeadShape;
 use crate::network::trace::Trace;
 use protocol::message::Image;
 
-/// timm's value for both towers of OpenVLA; PyTorch's own default would be 1e-5.
+/// timm's value for both towers of OpenVLA; PyTorch's default is 1e-5.
 const LAYER_NORM_EPSILON: f64 = 1e-6;
 const TOWER_NAMES: [&str; 2] = ["featurizer", "fused_featurizer"];
 
-/// All towers of a checkpoint.
+/// All vision towers of a checkpoint.
 pub struct VisionBackbone {
     towers: Vec<Tower>,
 }
@@ -36,7 +36,7 @@ struct Tower {
     patch_embed: Linear,
     /// (patches, width)
     pos_embed: Tensor,
-    /// (prefix tokens, width), when there are any.
+    /// (prefix tokens, width), if there are any.
     prefix: Option<Tensor>,
     blocks: Vec<Block>,
     device: Device,
@@ -58,7 +58,7 @@ struct Block {
 }
 
 impl VisionBackbone {
-    /// Takes the towers' weights; the first tower is DINO-like when there are two.
+    /// Loads the towers' weights; with two towers, the first one is DINO-like.
     pub fn load(mut weights: Part<'_>, configs: &[TowerConfig]) -> Result<VisionBackbone> {
         let mut towers = Vec::new();
         for (index, config) in configs.iter().enumerate() {
@@ -70,7 +70,7 @@ impl VisionBackbone {
         Ok(VisionBackbone { towers })
     }
 
-    /// Names of the towers with the number of blocks that are run.
+    /// Names of the towers with their numbers of used blocks.
     pub fn blocks_used(configs: &[TowerConfig]) -> Vec<(String, usize)> {
         let named = configs.iter().zip(TOWER_NAMES);
         named.map(|(config, name)| (format!("vision_backbone.{name}"), config.depth - 1)).collect()
@@ -183,7 +183,8 @@ impl Block {
         Ok(Block { norm1, query, key, value, proj, ls1, norm2, fc1, fc2, ls2, shape, backend })
     }
 
-    /// (images x tokens, width) -> the same; tokens of one image see each other and nothing else.
+    /// (images x tokens, width) -> the same shape; the tokens of an image attend only to each
+    /// other.
     fn forward(&self, rows: &Tensor, tokens: usize) -> Result<Tensor> {
         let images: Vec<Range<usize>> =
             (0..rows.dim(0)? / tokens).map(|image| image * tokens..(image + 1) * tokens).collect();

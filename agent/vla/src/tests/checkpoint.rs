@@ -1,4 +1,5 @@
-//! Loading: every weight is used or known to be dead, and unknown layouts are refused in words.
+//! Loading checkpoints: every weight is used or known to be unused, and unknown layouts are
+//! refused.
 
 use std::collections::HashMap;
 
@@ -7,7 +8,7 @@ use anyhow::Result;
 use super::*;
 use crate::checkpoint::config::Config;
 
-/// Copies a tiny checkpoint into a fresh folder, after a change of its weights and its config.
+/// Loads a copy of a tiny checkpoint with changed weights and configuration.
 fn load_changed(
     name: &str,
     weights: impl FnOnce(&mut HashMap<String, Tensor>) -> Result<()>,
@@ -28,7 +29,7 @@ fn load_changed(
 
 fn refusal(policy: Result<Vla>) -> String {
     match policy {
-        // The outermost context names a temporary folder.
+        // The outermost context contains a temporary path.
         Err(error) => error.chain().skip(1).map(ToString::to_string).collect::<Vec<_>>().join(": "),
         Ok(_) => "accepted".to_string(),
     }
@@ -37,7 +38,7 @@ fn refusal(policy: Result<Vla>) -> String {
 #[test]
 fn dead_weights_are_counted() -> Result<()> {
     assert_eq!(tiny("tiny", Backend::Kernels)?.network.dead_weights, 0);
-    // Per tower: a block of 12 weights (14 with layer scale) that is never run, and the final norm.
+    // Per tower: an unused block of 12 weights (14 with layer scale), and the final norm.
     assert_eq!(tiny("tiny-fused", Backend::Kernels)?.network.dead_weights, 14 + 12 + 2 * 2);
     Ok(())
 }
@@ -72,7 +73,7 @@ fn the_identity_does_not_depend_on_how_files_are_written() -> Result<()> {
         config["unnorm_key"] = only.expect("a dataset").clone().into();
         config["norm_stats"]["another_dataset"] = other;
     };
-    assert_eq!(identity(load_changed("tiny", |_| Ok(()), unread))?, expected, "fields not read");
+    assert_eq!(identity(load_changed("tiny", |_| Ok(()), unread))?, expected, "unused fields");
 
     let wide = |tensors: &mut HashMap<String, Tensor>| -> Result<()> {
         halve(tensors)?;
@@ -113,7 +114,7 @@ fn the_identity_does_not_depend_on_how_files_are_written() -> Result<()> {
 }
 
 #[test]
-fn what_computes_differently_has_another_identity() -> Result<()> {
+fn a_different_computation_has_a_different_identity() -> Result<()> {
     let expected = identity(tiny("tiny", Backend::Kernels))?;
     let one_weight = |tensors: &mut HashMap<String, Tensor>| -> Result<()> {
         let bias = tensors.get_mut("projector.fc2.bias").expect("a bias");
@@ -139,7 +140,7 @@ fn what_computes_differently_has_another_identity() -> Result<()> {
 }
 
 #[test]
-fn weights_that_no_output_depends_on_are_not_part_of_the_identity() -> Result<()> {
+fn unused_weights_are_not_part_of_the_identity() -> Result<()> {
     let dead = |tensors: &mut HashMap<String, Tensor>| -> Result<()> {
         let norm = tensors.get_mut("vision_backbone.featurizer.norm.bias").expect("a dead weight");
         *norm = (norm.clone() + 1.0)?;
@@ -160,7 +161,7 @@ fn weights_that_do_not_fit_are_refused() -> Result<()> {
             tensors.remove("projector.fc2.bias");
             Ok(())
         },
-        "weights: projector.fc2.bias is missing, expected shape [32]",
+        "weights: expected projector.fc2.bias of shape [32], got none",
     );
     check(
         |tensors| {
@@ -168,7 +169,7 @@ fn weights_that_do_not_fit_are_refused() -> Result<()> {
             tensors.insert("projector.fc3.bias".to_string(), extra);
             Ok(())
         },
-        "weights: 1 unexpected, the first is projector.fc3.bias",
+        "weights: expected only known tensors, got 1 others, such as projector.fc3.bias",
     );
     check(
         |tensors| {
@@ -182,7 +183,7 @@ fn weights_that_do_not_fit_are_refused() -> Result<()> {
 }
 
 #[test]
-fn unknown_layouts_are_refused_in_words() {
+fn unknown_layouts_are_refused_with_a_reason() {
     fn check(change: impl FnOnce(&mut serde_json::Value), expected: &str) {
         let got = refusal(load_changed("tiny", |_| Ok(()), change));
         assert!(got.contains(expected), "expected {expected:?}, got {got:?}");
@@ -215,22 +216,22 @@ fn unknown_layouts_are_refused_in_words() {
     );
     check(
         |c| c["unnorm_key"] = "bridge_orig".into(),
-        "unnorm_key: expected one of [\"rever_bridge\"], got bridge_orig",
+        "unnorm_key: expected one of [\"rever_bridge\"], got \"bridge_orig\"",
     );
     check(
         |c| c["prompt_template"] = serde_json::Value::Null,
-        "prompt_template: expected one, as llm_backbone_id \"rever-llama\" implies none",
+        "prompt_template: expected one, because llm_backbone_id \"rever-llama\" is unknown",
     );
     check(
         |c| c["pad_to_multiple_of"] = 128.into(),
-        "tokenizer.json: expected 896 tokens (and at most one for padding), got 960",
+        "tokenizer.json: expected 896 tokens and at most one for padding, got 960",
     );
 }
 
 #[test]
 fn openvla_7b_is_a_known_layout() -> Result<()> {
-    // The fields of openvla-7b's config.json that decide its layout; text_config says only what
-    // differs from Hugging Face's defaults.
+    // The fields of openvla-7b's config.json that determine its layout; its text_config contains
+    // only what differs from Hugging Face's defaults.
     let text = r#"{"model_type": "openvla", "llm_backbone_id": "llama2-7b-pure",
         "timm_model_ids": ["vit_large_patch14_reg4_dinov2.lvd142m", "vit_so400m_patch14_siglip_224"],
         "timm_override_act_layers": [null, null], "use_fused_vision_backbone": true,

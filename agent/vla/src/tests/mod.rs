@@ -1,4 +1,4 @@
-//! The policy as a whole: parity with PyTorch, shared prefixes, batches, seeds, refusals.
+//! Tests of the whole policy: parity with PyTorch, shared prefixes, batches, seeds, refusals.
 
 mod checkpoint;
 mod parity;
@@ -13,7 +13,7 @@ use decision::{Image, Policy as _};
 
 use super::{Backend, DeviceName, Vla};
 
-/// Both tiny layouts: one tower as the shipped model has, two as OpenVLA-7B has.
+/// Both tiny layouts: one tower as in the shipped model, two as in OpenVLA-7B.
 const TINY: [&str; 2] = ["tiny", "tiny-fused"];
 
 fn fixtures() -> PathBuf {
@@ -24,7 +24,7 @@ fn tiny(name: &str, backend: Backend) -> Result<Vla> {
     Vla::load_on(&fixtures().join(name), &Device::Cpu, backend)
 }
 
-/// Golden tensors of one file by name.
+/// The golden tensors of one file by name.
 struct Golden(std::collections::HashMap<String, Tensor>);
 
 impl Golden {

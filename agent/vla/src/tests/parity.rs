@@ -1,4 +1,5 @@
-//! Every layer's output equals PyTorch's; one token at a time equals the whole sequence at once.
+//! Every layer's output equals PyTorch's, and decoding token by token equals processing the whole
+//! sequence.
 
 use anyhow::Result;
 
@@ -7,7 +8,7 @@ use crate::network::decoder::Wanted;
 use crate::network::forward::Context;
 use crate::network::trace::Trace;
 
-/// Largest difference from PyTorch's float32 results in any number of any layer.
+/// Maximum difference from PyTorch's float32 results in any element of any layer.
 const TOLERANCE: f32 = 1e-4;
 
 #[test]
@@ -70,7 +71,7 @@ fn steps_onto_a_shared_prefix_equal_the_whole_sequence() -> Result<()> {
                 let difference = largest_difference(&hidden, &expected)?;
                 assert!(difference < 1e-5, "{name} {backend:?}: {difference}");
                 if backend == Backend::Kernels {
-                    assert_eq!(difference, 0.0, "{name}: the kernels' sums have one order");
+                    assert_eq!(difference, 0.0, "{name}: the kernels' sums have a fixed order");
                 }
             }
         }
@@ -94,7 +95,7 @@ fn the_shipped_model_equals_pytorch_on_recorded_observations() -> Result<()> {
             println!("observation {index} {part}: {difference:.1e}");
             assert!(difference < TOLERANCE, "observation {index} {part}: {difference}");
         }
-        // The same tokens come out of a whole proposal, and they make sense.
+        // A whole proposal gives the same tokens, and they are well-formed.
         let instruction = policy.parser().text(&prompt[2..3]);
         let request = decision::ProposalRequest {
             image: &image,
@@ -111,7 +112,7 @@ fn the_shipped_model_equals_pytorch_on_recorded_observations() -> Result<()> {
     Ok(())
 }
 
-/// Hidden states of each row while rows take their tokens one at a time.
+/// Hidden states of each row when the rows process their tokens one at a time.
 fn step_rows(
     policy: &Vla,
     image: &Image,
@@ -140,7 +141,7 @@ fn step_rows(
     hidden.iter().map(|states| Ok(Tensor::cat(states, 0)?)).collect()
 }
 
-/// Greedy tokens with the hidden state and logits that chose each, as PyTorch's were made.
+/// Greedy tokens with the hidden state and logits that selected each, computed like PyTorch's.
 fn greedy(
     policy: &Vla,
     image: &Image,

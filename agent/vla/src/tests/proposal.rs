@@ -1,4 +1,4 @@
-//! Proposals: batches, seeds, temperatures, and what is refused.
+//! Proposals: batches, seeds, temperatures and refusals.
 
 use anyhow::Result;
 use candle_core::D;
@@ -6,7 +6,7 @@ use candle_core::D;
 use super::*;
 use decision::{Candidate, Proposal, ProposalRequest, TAGS};
 
-/// Parts of the confidence: the tags and seven numbers of an action.
+/// Parts of the confidence: the tags and the seven dimensions of an action.
 const PARTS: usize = TAGS.len() + 7;
 
 const INSTRUCTION: &str = "Put the spoon on the towel";
@@ -21,7 +21,7 @@ fn request(image: &Image, candidates: usize, temperature: f32, seed: u64) -> Pro
 }
 
 #[test]
-fn a_request_does_not_depend_on_the_requests_beside_it() -> Result<()> {
+fn a_request_does_not_depend_on_the_other_requests_of_the_batch() -> Result<()> {
     for name in TINY {
         let policy = tiny(name, Backend::Kernels)?;
         let side = policy.info().image_size.0;
@@ -38,7 +38,7 @@ fn a_request_does_not_depend_on_the_requests_beside_it() -> Result<()> {
             .collect();
         let together = policy.propose_now(&requests)?;
         for (request, expected) in requests.iter().zip(&together) {
-            // Bit for bit: tokens, log-probability, hidden state.
+            // Bitwise equal: tokens, log-probability, hidden state.
             assert_eq!(&policy.propose_now(&[*request])?, std::slice::from_ref(expected));
         }
         let mut reversed: Vec<ProposalRequest<'_>> = requests.clone();
@@ -51,7 +51,7 @@ fn a_request_does_not_depend_on_the_requests_beside_it() -> Result<()> {
 }
 
 #[test]
-fn calls_side_by_side_answer_as_calls_one_after_the_other() -> Result<()> {
+fn parallel_calls_give_the_same_results_as_sequential_calls() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
     let images: Vec<Image> = (0..12).map(|seed| image(seed, policy.info().image_size.0)).collect();
     let requests: Vec<_> = images.iter().map(|image| request(image, 5, 1.0, 9)).collect();
@@ -74,7 +74,7 @@ fn calls_side_by_side_answer_as_calls_one_after_the_other() -> Result<()> {
 }
 
 #[test]
-fn threads_do_not_change_a_bit() -> Result<()> {
+fn the_number_of_threads_does_not_change_the_result() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
     let image = image(3, policy.info().image_size.0);
     let requests = [request(&image, 8, 1.0, 5), request(&image, 3, 1.0, 6)];
@@ -87,7 +87,7 @@ fn threads_do_not_change_a_bit() -> Result<()> {
 }
 
 #[test]
-fn seeds_decide_and_candidates_have_streams_of_their_own() -> Result<()> {
+fn seeds_determine_the_result_and_each_candidate_has_its_own_stream() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
     let image = image(1, policy.info().image_size.0);
     let propose = |candidates, seed| -> Result<Vec<Candidate>> {
@@ -129,7 +129,7 @@ fn both_backends_sample_the_same_tokens() -> Result<()> {
 }
 
 #[test]
-fn first_tokens_are_distributed_as_the_softmax_says() -> Result<()> {
+fn first_tokens_follow_the_softmax_distribution() -> Result<()> {
     let mut policy = tiny("tiny", Backend::Kernels)?;
     policy.parser.config.completion_tokens_max = 1;
     let image = image(4, policy.info().image_size.0);
@@ -146,10 +146,10 @@ fn first_tokens_are_distributed_as_the_softmax_says() -> Result<()> {
         let proposal = policy.propose_now(&[request(&image, draws, temperature, 11)])?.remove(0);
         let mut counts = vec![0u32; policy.parser.config.vocabulary];
         for candidate in &proposal.candidates {
-            // A completion of no tokens drew the end at once.
+            // A completion without tokens sampled the end at once.
             counts[candidate.tokens.first().map_or(2, |&token| token as usize)] += 1;
         }
-        // Chi-squared over the tokens expected at least five times, all others together.
+        // Chi-squared over the tokens expected at least five times; all others count as one cell.
         let expected: Vec<f64> = softmax.iter().map(|&p| f64::from(p) * draws as f64).collect();
         let (mut statistic, mut cells, mut rest) = (0.0, 0u32, (0.0, 0.0));
         for (&count, &expected) in counts.iter().zip(&expected) {
@@ -161,7 +161,8 @@ fn first_tokens_are_distributed_as_the_softmax_says() -> Result<()> {
             }
         }
         statistic += (rest.0 - rest.1).powi(2) / f64::max(rest.1, 1.0);
-        // Mean plus four deviations of a chi-squared with as many degrees of freedom as cells.
+        // The mean plus four standard deviations of a chi-squared distribution with this number of
+        // cells.
         let limit = f64::from(cells) + 4.0 * (2.0 * f64::from(cells)).sqrt();
         assert!(cells > 10 && statistic < limit, "{statistic} over {cells} cells, limit {limit}");
     }
@@ -188,7 +189,7 @@ fn log_probabilities_are_those_of_temperature_one() -> Result<()> {
             let mut sum: f32 =
                 candidate.tokens.iter().enumerate().map(|(row, &id)| likelihood(row, id)).sum();
             let ended = candidate.log_probability - sum;
-            // A candidate that was cut has no end in its sum.
+            // A candidate that was cut has no end token in its sum.
             if ended.abs() > 1e-3 {
                 sum += likelihood(count, 2);
             }
@@ -200,7 +201,7 @@ fn log_probabilities_are_those_of_temperature_one() -> Result<()> {
 }
 
 #[test]
-fn confidence_is_the_sum_over_each_tags_text_and_each_action_number() -> Result<()> {
+fn confidence_is_the_sum_over_each_section_and_each_action_dimension() -> Result<()> {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/bridge-small");
     for policy in [Vla::load(&shipped, DeviceName::Cpu)?, tiny("tiny", Backend::Kernels)?] {
         let image = image(6, policy.info().image_size.0);
@@ -222,7 +223,7 @@ fn confidence_is_the_sum_over_each_tags_text_and_each_action_number() -> Result<
     Ok(())
 }
 
-/// The tag in whose text the end lies, found the slow way.
+/// The tag of the section that contains the end of the text, by a direct search.
 fn section(text: &str) -> usize {
     let ends = |at: usize, tag: &str| {
         let begins = at == 0 || text[..at].ends_with(char::is_whitespace);
@@ -235,7 +236,7 @@ fn section(text: &str) -> usize {
 }
 
 #[test]
-fn requests_that_cannot_be_answered_are_refused_in_words() -> Result<()> {
+fn invalid_requests_are_refused_with_a_reason() -> Result<()> {
     let policy = tiny("tiny", Backend::Kernels)?;
     let check = |request: ProposalRequest<'_>, expected: &str| match policy.propose_now(&[request])
     {
@@ -245,7 +246,7 @@ fn requests_that_cannot_be_answered_are_refused_in_words() -> Result<()> {
     let (good, large) = (image(0, 32), image(0, 64));
     check(
         request(&large, 1, 1.0, 0),
-        "image: expected 32 x 32 pixels, got 64 x 64; ask the server for that size",
+        "image: expected 32 x 32 pixels, got 64 x 64; request images of that size from the server",
     );
     let short = Image { pixels: vec![0; 5].into(), ..good.clone() };
     check(request(&short, 1, 1.0, 0), "image: expected 3072 bytes, got 5");
@@ -266,7 +267,7 @@ fn tokens_parse_strictly() -> Result<()> {
     assert_eq!(parsed.reasoning.subtask, "reach the spoon");
     assert_eq!(parsed.reasoning.visible_objects[1].bounding_box, [60, 62, 90, 98]);
     assert_eq!(parsed.reasoning.gripper_position, [[120, 84]]);
-    // Digits 1, 64, 128, 129, 200, 255, 256 below a vocabulary of 960.
+    // The digits 1, 64, 128, 129, 200, 255, 256 below a vocabulary of 960.
     assert_eq!(parsed.action_tokens, [959, 896, 832, 831, 760, 705, 704]);
     assert!((parsed.actions.first()[0] + 0.03 - 0.06 * 0.5 / 255.0).abs() < 1e-7);
     assert_eq!(parsed.actions.first()[6], 1.0);
@@ -277,8 +278,8 @@ fn tokens_parse_strictly() -> Result<()> {
     let length = good.len();
     check(&good[..length - 1], "expected 7 action tokens, got 6");
     check(&good[..length - 7], "expected 7 action tokens, got 0");
-    check(&good[..length - 8], "expected ACTION: got the end");
-    check(&[], "expected TASK: got the end");
+    check(&good[..length - 8], "expected ACTION:, got the end");
+    check(&[], "expected TASK:, got the end");
     check(
         &[&good[..], &[700]].concat(),
         "expected the end after 7 action tokens, got \"<reserved47>\"",

@@ -1,4 +1,4 @@
-//! Shell scripts in the place of a server show what the supervisor does with each kind of server.
+//! Shell scripts in place of servers test how the supervisor handles each kind of failure.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -14,7 +14,7 @@ use super::*;
 const WAIT_SECS: u64 = 20;
 const FOR_EVER: Duration = Duration::from_secs(3600);
 
-/// A server that is a script; `$FOLDER` is a folder of its own.
+/// A server that is a shell script; `$FOLDER` is its own folder.
 struct Script {
     folder: TempDir,
     count: usize,
@@ -72,7 +72,7 @@ fn error_of(script: &str) -> String {
 }
 
 #[test]
-fn all_are_ready_and_none_outlives_the_value() {
+fn all_servers_are_ready_and_end_when_the_value_is_dropped() {
     let mut script = Script::new("echo noise; echo ready $$; exec sleep 1000");
     script.count = 2;
     let servers = script.start(beats).unwrap();
@@ -84,36 +84,41 @@ fn all_are_ready_and_none_outlives_the_value() {
 }
 
 #[test]
-fn a_server_that_never_starts_is_an_error_with_its_last_words() {
+fn a_server_that_never_starts_is_an_error_with_its_last_output() {
     assert_eq!(
         error_of("echo no display >&2; exit 3"),
-        "no server could be started: a server ended 3 times, the last time: exit status: 3\nno display"
+        "no environment server could be started: a server ended 3 times; last reason: exit status: 3\nno display"
     );
 }
 
 #[test]
-fn last_words_carry_no_control_characters_and_need_not_be_unicode() {
+fn the_last_output_has_no_control_characters_and_need_not_be_unicode() {
     let error = error_of(r"printf 'a\033[31mred\377\nb\n' >&2; exit 3");
     assert!(error.ends_with("\na[31mred\u{fffd}\nb"), "{error:?}");
 }
 
 #[test]
-fn a_death_for_lack_of_memory_is_named() {
+fn running_out_of_memory_is_reported() {
     let error = error_of("echo 'terminate called: std::bad_alloc' >&2; exit 134");
     assert!(error.contains("exit status: 134 (out of memory)\n"), "{error}");
     let error = error_of("kill -9 $$");
-    assert!(error.contains("SIGKILL) (killed from outside, perhaps for lack of memory"), "{error}");
+    assert!(
+        error.contains(
+            "SIGKILL) (killed by another process, possibly by the kernel for lack of memory"
+        ),
+        "{error}"
+    );
 }
 
 #[test]
-fn one_that_dies_while_it_starts_is_started_again() {
+fn a_server_that_ends_while_starting_is_restarted() {
     let script = "if mkdir $FOLDER/once; then exit 1; fi; echo ready $$; exec sleep 1000";
     let servers = Script::new(script).start(beats).unwrap();
     assert_eq!((servers.server_ids().len(), servers.restarts(), servers.given_up()), (1, 1, None));
 }
 
 #[test]
-fn one_that_cannot_start_does_not_stop_the_others() {
+fn a_server_that_cannot_start_does_not_stop_the_others() {
     let mut script = Script::new(
         "if mkdir $FOLDER/once; then echo ready $$; exec sleep 1000; fi; echo broken >&2; exit 1",
     );
@@ -123,7 +128,7 @@ fn one_that_cannot_start_does_not_stop_the_others() {
 }
 
 #[test]
-fn one_that_dies_or_is_replaced_is_started_again() {
+fn a_server_that_ends_or_is_replaced_is_restarted() {
     let script = Script::new("echo ready $$; exec sleep 1000");
     let servers = script.start(beats).unwrap();
     let first = servers.server_ids();
@@ -137,7 +142,7 @@ fn one_that_dies_or_is_replaced_is_started_again() {
 }
 
 #[test]
-fn one_that_is_frozen_is_killed_and_replaced_when_its_heartbeats_stop() {
+fn a_frozen_server_is_replaced_when_its_heartbeats_stop() {
     let mut script = Script::new("echo ready $$; exec sleep 1000");
     script.silence_max = Duration::from_secs(1);
     let servers = script.start(|_| None).unwrap();
@@ -156,12 +161,12 @@ fn the_processes_of_a_server_end_with_it() {
     let child = child.trim().parse().unwrap();
     assert!(is_alive(child));
     drop(servers);
-    // The system removes a process that nobody waits for when it finds the time.
+    // The operating system removes a process without a waiting parent at some later time.
     wait_until("the child is gone", || !is_alive(child));
 }
 
 #[test]
-fn the_end_of_a_server_is_noticed_though_another_process_holds_its_pipes() {
+fn the_end_of_a_server_is_detected_even_if_another_process_holds_its_pipes() {
     let script =
         "mkdir $FOLDER/once && { setsid sleep 30 & exit 1; }; echo ready $$; exec sleep 1000";
     let servers = Script::new(script).start(beats).unwrap();
@@ -169,7 +174,7 @@ fn the_end_of_a_server_is_noticed_though_another_process_holds_its_pipes() {
 }
 
 #[test]
-fn one_that_keeps_dying_is_given_up() {
+fn a_server_that_keeps_ending_is_given_up() {
     let script = Script::new("echo ready $$; echo broken >&2");
     let servers = script.start(beats).unwrap();
     wait_until("the server is given up", || servers.given_up().is_some());

@@ -1,4 +1,4 @@
-//! What a run keeps, whatever happens to its process and to its files.
+//! Tests of the writer: a run survives killed processes and damaged files.
 
 use std::os::unix::fs::PermissionsExt;
 
@@ -47,14 +47,14 @@ fn stored(folder: &Path) -> Vec<Label> {
     labels(&folder.join("labels.sqlite")).expect("labels")
 }
 
-/// Overwrites a row of any database, as damage or a forger would.
+/// Overwrites a row of any database, like damage or a forgery.
 fn tamper(path: &Path, sql: &str) {
     let connection = Connection::open(path).expect("a database");
     assert!(connection.execute(sql, []).expect("tampered") > 0);
 }
 
 #[test]
-fn a_run_is_resumed_with_what_it_has_and_every_record_says_how_it_came_about() {
+fn a_run_is_resumed_with_its_records_and_every_record_has_its_provenance() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     let path = record(&run, 0);
@@ -90,13 +90,13 @@ fn a_closed_run_is_free_while_a_starting_child_still_holds_its_files() {
 }
 
 #[test]
-fn a_label_is_there_with_its_record_and_neither_without_the_other() {
+fn index_and_label_store_get_an_episode_together_or_not_at_all() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     let path = record(&run, 0);
     let expected = Label::new(&episode(&run, 0), &path);
     assert_eq!(stored(folder.path()), [expected]);
-    // While another process holds the label store, neither index nor store gets the episode.
+    // While another process locks the label store, neither index nor store gets the episode.
     let other = Connection::open(folder.path().join("labels.sqlite")).expect("a store");
     other.execute_batch("BEGIN EXCLUSIVE").expect("locked");
     run.connection.busy_timeout(std::time::Duration::ZERO).expect("no wait");
@@ -127,7 +127,7 @@ fn an_episode_in_which_the_policy_never_acted_is_recorded_without_a_label() {
 }
 
 #[test]
-fn labels_that_could_not_be_written_are_said_at_the_end_and_completed_at_the_next_start() {
+fn labels_that_could_not_be_written_are_reported_and_written_when_the_run_is_resumed() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     let other = Connection::open(folder.path().join("labels.sqlite")).expect("a store");
@@ -136,7 +136,7 @@ fn labels_that_could_not_be_written_are_said_at_the_end_and_completed_at_the_nex
     record(&run, 0);
     let error = format!("{:#}", run.complete().expect_err("one label is missing"));
     assert!(error.starts_with("1 recorded episodes of the run run-"), "{error}");
-    assert!(error.contains("rerun the same command: cannot write the index of"), "{error}");
+    assert!(error.contains("to write them: cannot write the index of"), "{error}");
     assert!(error.contains("labels.sqlite: database is locked"), "{error}");
     other.execute_batch("COMMIT").expect("unlocked");
     assert_eq!(stored(folder.path()), []);
@@ -146,7 +146,7 @@ fn labels_that_could_not_be_written_are_said_at_the_end_and_completed_at_the_nex
 }
 
 #[test]
-fn labels_say_what_records_say_whatever_was_written_beside_them() {
+fn labels_are_restored_from_the_records() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     for number in 0..3 {
@@ -183,7 +183,7 @@ fn a_moved_run_has_labels_that_name_its_records() {
 }
 
 #[test]
-fn a_reader_leaves_the_index_of_a_running_writer_alone() {
+fn a_reader_does_not_change_the_index_of_a_running_writer() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     for number in 0..3 {
@@ -191,7 +191,7 @@ fn a_reader_leaves_the_index_of_a_running_writer_alone() {
     }
     let index = run.folder.join(INDEX);
     let expected = run.summaries().expect("summaries");
-    // An index of another build, a row that was tampered with, and a row whose summary lacks a field.
+    // An index of another build, a row that was modified, and a row whose summary lacks a field.
     let check = |change: &dyn Fn(&Connection)| {
         let other = Connection::open(&index).expect("an index");
         change(&other);
@@ -217,7 +217,7 @@ fn a_reader_leaves_the_index_of_a_running_writer_alone() {
     });
     std::fs::write(record_path(&run.folder, &expected[1].identity.id()), b"half").expect("damaged");
     assert_eq!(episodes(&summaries(&run.folder).expect("the others")), [0, 2]);
-    // The writer goes on.
+    // The writer continues.
     record(&run, 3);
     assert_eq!(stored(folder.path()).len(), 4);
     run.complete().expect("nothing is missing");
@@ -244,7 +244,7 @@ fn a_reader_needs_no_permission_to_write() {
 }
 
 #[test]
-fn the_index_is_made_anew_whatever_it_was() {
+fn the_index_is_always_recreated() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     for number in 0..50 {
@@ -291,7 +291,7 @@ fn a_damaged_record_is_set_aside_and_its_episode_is_run_again() {
     let paths: Vec<PathBuf> = (0..5).map(|number| record(&run, number)).collect();
     let (path, expected) = (run.folder.clone(), run.summaries().expect("summaries"));
     drop(run);
-    // One bit, an end that is missing, nothing at all, and the record of another episode.
+    // A flipped bit, a truncated file, an empty file, and the record of another episode.
     let mut bytes = std::fs::read(&paths[0]).expect("a record");
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
@@ -343,7 +343,7 @@ fn a_record_of_another_run_is_refused() {
 }
 
 #[test]
-fn a_label_store_that_cannot_be_written_is_said_before_anything_starts() {
+fn a_label_store_that_cannot_be_written_is_reported_before_anything_starts() {
     let folder = tempfile::tempdir().expect("a folder");
     let check = |labels: &Path, expected: &str| {
         let request = RunRequest { labels: Some(labels.to_path_buf()), ..request(folder.path()) };
@@ -361,7 +361,7 @@ fn a_label_store_that_cannot_be_written_is_said_before_anything_starts() {
 }
 
 #[test]
-fn what_a_killed_process_left_unfinished_is_nothing() {
+fn incomplete_files_of_a_killed_process_are_ignored() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     let fault = FaultRecord {
@@ -391,7 +391,7 @@ fn what_a_killed_process_left_unfinished_is_nothing() {
     assert_eq!(faults::faults(&path).expect("faults"), std::slice::from_ref(&fault));
     run.fault(&fault).expect("noted");
     drop(run);
-    // A line that is no text, and one that is no fault, are not counted; those around them are.
+    // Lines that are not text or not a fault are ignored; those around them are counted.
     append(b"\xff\xfe\n{\"attempt\": 1}\n");
     let run = open(folder.path());
     run.fault(&fault).expect("noted");

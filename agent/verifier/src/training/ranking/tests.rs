@@ -1,4 +1,4 @@
-//! Rankings of made-up episodes with and without something to learn.
+//! Rankings of synthetic episodes with and without a signal.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -8,8 +8,9 @@ use crate::training::TrainingEpisode;
 use crate::training::set::tests::episode;
 use crate::training::tests::decision;
 
-/// Episodes of 20 decisions among five candidates; success rises with how sure the policy was of part 6 of the executed
-/// ones. Part 2 is as variable and means nothing; a low part 4 helps, which no verifier may believe.
+/// Episodes of 20 decisions among five candidates. Success becomes more likely with the confidence
+/// of part 6 of the executed candidates. Part 2 varies as much and has no effect; a low part 4
+/// helps, which the sign constraint excludes.
 fn made_up(episodes: usize, strength: f64, seed: u64) -> Vec<TrainingEpisode> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut one = |number: usize| {
@@ -48,20 +49,20 @@ fn fit_all(episodes: Vec<TrainingEpisode>) -> Option<(Ranking, RankingEvidence)>
 }
 
 #[test]
-fn what_makes_candidates_better_is_found() {
+fn a_feature_with_an_effect_is_found() {
     let (ranking, evidence) = fit_all(made_up(400, 0.7, 7)).expect("enough episodes");
     let weights = ranking.weights();
     assert!(weights[6] > 0.02 && weights[2].abs() < 0.4 * weights[6], "{weights:?}");
     assert_eq!((weights[4], weights[16]), (0.0, 0.0));
     let ReRankingGain { percentage_points, standard_error } = evidence.gain;
     assert!(percentage_points > 3.0 * standard_error && percentage_points > 10.0, "{evidence:?}");
-    // All actions are the same, so that the medoid is a draw.
+    // All actions are equal, so that every candidate is a medoid.
     assert!(evidence.medoid_gain.percentage_points.abs() < 1e-9, "{evidence:?}");
     assert_eq!((evidence.episodes, evidence.decisions), (400, 8000));
 }
 
 #[test]
-fn nothing_is_claimed_where_nothing_is() {
+fn no_gain_is_reported_without_a_signal() {
     let gains: Vec<ReRankingGain> = (0..3)
         .map(|seed| fit_all(made_up(60, 0.0, seed)).expect("enough episodes").1.gain)
         .collect();
@@ -72,7 +73,7 @@ fn nothing_is_claimed_where_nothing_is() {
 }
 
 #[test]
-fn outcomes_of_a_judged_fold_do_not_reach_the_weights_that_judge_it() {
+fn outcomes_of_a_fold_do_not_affect_the_weights_that_evaluate_it() {
     let episodes = made_up(30, 0.7, 3);
     let set = TrainingSet::new(2, 7, episodes).expect("whole");
     let options = TrainingOptions::default();
@@ -91,8 +92,8 @@ fn outcomes_of_a_judged_fold_do_not_reach_the_weights_that_judge_it() {
         let others = episodes.iter().filter(|episode| episode.fold != 2);
         others.map(|episode| models.estimate(episode, judged).advantages).collect()
     };
-    assert_eq!(estimate(&set, 2), estimate(&turned, 2), "fold 2 is judged and not seen");
-    assert_ne!(estimate(&set, 1), estimate(&turned, 1), "fold 2 is seen");
+    assert_eq!(estimate(&set, 2), estimate(&turned, 2), "fold 2 is evaluated and not used");
+    assert_ne!(estimate(&set, 1), estimate(&turned, 1), "fold 2 is used");
 }
 
 #[test]
@@ -103,9 +104,9 @@ fn episodes_of_one_layout_count_as_one_cluster() {
     let single: Vec<_> = starts.iter().zip(gains).collect();
     let gain = mean_gain(&single);
     assert_eq!(gain.percentage_points, 2.0);
-    // Squares 1, 1, 16 and 16 of four: 34 / 3 / 4.
+    // The squares are 1, 1, 16 and 16 for four clusters: 34 / 3 / 4.
     assert!((gain.standard_error - (34.0_f64 / 12.0).sqrt()).abs() < 1e-12);
-    // Each repeated with the same gain: the mean is no better known than before.
+    // Each episode is repeated with the same gain: the mean is not known more precisely.
     let repeated: Vec<_> = single.iter().chain(&single).copied().collect();
     assert!((mean_gain(&repeated).standard_error - gain.standard_error).abs() < 1e-12);
 }

@@ -1,4 +1,4 @@
-//! Records of made-up episodes, eligible and not.
+//! Records of synthetic episodes, eligible and ineligible.
 
 use decision::{ActionChunk, Reasoning};
 use store::labels::{Label, LabelStore};
@@ -16,7 +16,7 @@ fn parse(_: &[u32]) -> Result<Parsed, Malformed> {
     Ok(Parsed { reasoning: Reasoning::default(), action_tokens: vec![1; 7], actions })
 }
 
-/// The first part's confidence is the first token's log-probability.
+/// The confidence of the first part is the log-probability of the first token.
 fn confidence(_: &[u32], log_probabilities: &[f32]) -> Vec<f32> {
     let mut confidence = vec![0.0; 16];
     confidence[0] = log_probabilities[0];
@@ -37,8 +37,9 @@ fn read(record: &EpisodeRecord) -> anyhow::Result<TrainingEpisode> {
     with_reader(|reader| eligible_episode(record, reader))
 }
 
-/// Three decisions between two candidates each, of which the first is executed; in the last none is well formed. Each
-/// decision is followed by a step that executes the second action of its chunk.
+/// Three decisions with two candidates each, of which the first is executed; in the last decision
+/// none is well formed. Each decision is followed by a step that executes the second action of its
+/// chunk.
 fn record(episode: u32) -> EpisodeRecord {
     let candidate = |value: f32, is_well_formed: bool| CandidateRecord {
         tokens: vec![1; 7],
@@ -97,7 +98,7 @@ fn decision(record: &mut EpisodeRecord, index: usize) -> &mut DecisionRecord {
     record.steps[index].decision.as_mut().expect("a decision")
 }
 
-/// As if no candidate was ever well formed.
+/// Makes all candidates malformed.
 fn never_act(record: &mut EpisodeRecord) {
     for decision in record.steps.iter_mut().filter_map(|step| step.decision.as_mut()) {
         decision.chosen = None;
@@ -135,7 +136,7 @@ fn several_candidates_with_hidden_states_give_decisions() {
     let drawn = read(&record).expect("eligible").decisions.expect("two candidates");
     assert_eq!(drawn.len(), 2);
     let last = &drawn[1];
-    // Hidden states 2 and -9, and the grasp of the step before.
+    // Hidden states 2 and -9, and the grasp of the previous step.
     assert_eq!((last.hidden_mean.as_slice(), last.statistics[1]), ([-3.5, 0.5].as_slice(), 1.0));
     let rows = last.candidates.rows();
     assert_eq!((rows[0][0], rows[1][0]), (0.5, -0.5));
@@ -149,7 +150,7 @@ fn several_candidates_with_hidden_states_give_decisions() {
 }
 
 #[test]
-fn the_first_well_formed_candidate_is_a_draw() {
+fn the_first_well_formed_candidate_is_a_sample() {
     let mut record = record(0);
     record.identity.strategy = "first-well-formed".to_owned();
     let first = decision(&mut record, 0);
@@ -160,7 +161,7 @@ fn the_first_well_formed_candidate_is_a_draw() {
 }
 
 #[test]
-fn what_is_not_eligible_is_refused_with_the_reason() {
+fn an_ineligible_episode_is_refused_with_the_reason() {
     let check = |change: fn(&mut EpisodeRecord), expected: &str| {
         let mut record = record(0);
         change(&mut record);
@@ -173,16 +174,16 @@ fn what_is_not_eligible_is_refused_with_the_reason() {
     );
     check(
         |record| record.identity.seed = SeedRange::Evaluation.first(),
-        "expected a seed of the collection range from 1000000000 on, got 3000000000",
+        "expected a seed in the collection range (from 1000000000), got 3000000000",
     );
     check(
         |record| record.identity.seed = SeedRange::Tuning.first() + 5,
-        "expected a seed of the collection range from 1000000000 on, got 2000000005",
+        "expected a seed in the collection range (from 1000000000), got 2000000005",
     );
     check(|record| record.identity.temperature = 0.0, "expected a temperature above 0, got 0");
     check(
         |record| record.versions.policy = "beef".to_owned(),
-        "expected hidden states of the policy to train for, got policy beef",
+        "expected hidden states of the verifier's policy, got those of policy beef",
     );
     check(|record| record.steps.clear(), "expected an outcome, got an episode without steps");
     check(
@@ -204,14 +205,14 @@ fn hidden_states_of_selected_candidates_are_not_used() {
         assert_eq!(
             read(&record).expect_err("selected").to_string(),
             format!(
-                "expected executed candidates that were drawn (strategy sample), got strategy {strategy}"
+                "expected candidates that were sampled, not selected (strategy sample), got strategy {strategy}"
             )
         );
     }
 }
 
 #[test]
-fn an_episode_in_which_the_policy_never_acted_is_no_outcome() {
+fn an_episode_in_which_the_policy_never_acted_has_no_outcome() {
     let mut record = record(0);
     never_act(&mut record);
     assert_eq!(
@@ -260,7 +261,7 @@ fn a_label_store_counts_what_is_excluded_by_its_reason() {
         assert!(store.insert(&label).expect("a row"));
     }
     drop(store);
-    // One record is damaged after its label was written, another one says something else.
+    // One record is damaged after its label was written, another one is changed.
     std::fs::write(file(&records[5]), b"damaged").expect("a file");
     records[6].statistics.is_success = false;
     write(folder.path(), &records[6..]);
@@ -270,19 +271,19 @@ fn a_label_store_counts_what_is_excluded_by_its_reason() {
     let expected = [
         ("another policy", 1),
         ("record cannot be read", 1),
-        ("record disagrees with its label", 1),
+        ("record differs from its label", 1),
         ("record on another machine", 1),
         ("seed outside the collection range", 1),
         ("the policy never acted", 1),
     ];
     assert_eq!(excluded, BTreeMap::from(expected));
 
-    // Removed, and made again with the same options.
+    // The run is removed and started again with the same options.
     records[0].identity.run = "again".to_owned();
     write(folder.path(), &records[..1]);
     assert_eq!(from_labels(&path).expect("a whole store").1["record of another run"], 1);
     std::fs::remove_file(file(&records[0])).expect("it is there");
-    assert_eq!(from_labels(&path).expect("a whole store").1["record is gone"], 1);
+    assert_eq!(from_labels(&path).expect("a whole store").1["record is missing"], 1);
     let missing = from_labels(&folder.path().join("none.sqlite")).expect_err("no store");
     assert!(missing.to_string().ends_with("none.sqlite: expected a file, got none"), "{missing}");
 }
