@@ -19,7 +19,8 @@ pub const COLUMNS_DEFAULT: usize = 80;
 pub fn answer(results: &Results, columns: usize) -> String {
     let headline =
         Headline::new(results).map_or_else(String::new, |one| wrapped(&one.text(), columns));
-    let parts = [headline, rates(results, columns), gains(results), remarks(results)];
+    let parts =
+        [headline, rates(results, columns), gains(results, columns), remarks(results, columns)];
     parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
 }
 
@@ -42,8 +43,7 @@ fn rates(results: &Results, columns: usize) -> String {
     };
     let mut rows: Vec<Vec<String>> =
         std::iter::once(head).chain(results.settings.iter().map(row)).collect();
-    if results.tasks.len() < 2 || aligned(&rows).lines().any(|line| line.chars().count() > columns)
-    {
+    if results.tasks.len() < 2 || is_wider(&rows, columns) {
         rows.iter_mut().for_each(|row| drop(row.drain(2..2 + names.len())));
     }
     let each = episodes.map_or_else(String::new, |count| format!(", n = {count} each"));
@@ -51,7 +51,7 @@ fn rates(results: &Results, columns: usize) -> String {
 }
 
 /// Paired gains, with the verdict for which they are made.
-fn gains(results: &Results) -> String {
+fn gains(results: &Results, columns: usize) -> String {
     if results.gains.is_empty() {
         return String::new();
     }
@@ -69,11 +69,21 @@ fn gains(results: &Results) -> String {
         ]
     };
     let head = ["", "gain [95 % interval]", "pairs", ""].map(str::to_owned).to_vec();
-    let rows: Vec<Vec<String>> =
+    let mut rows: Vec<Vec<String>> =
         std::iter::once(head).chain(results.gains.iter().map(row)).collect();
+    // The verdict can be read off the interval; the number of pairs is that of episodes.
+    for _ in 0..2 {
+        if is_wider(&rows, columns) {
+            rows.iter_mut().for_each(|row| drop(row.pop()));
+        }
+    }
     let table = aligned(&rows);
     let table: String = table.lines().map(|line| format!("{}\n", line.trim_end())).collect();
     format!("Gains in percentage points, on the same initial layouts\n{table}")
+}
+
+fn is_wider(rows: &[Vec<String>], columns: usize) -> bool {
+    aligned(rows).lines().any(|line| line.trim_end().chars().count() > columns)
 }
 
 /// A setting beside another, without what both share.
@@ -91,7 +101,7 @@ fn within(setting: Setting, beside: Setting) -> String {
 }
 
 /// What must be known beside the rates: only what there is.
-fn remarks(results: &Results) -> String {
+fn remarks(results: &Results, columns: usize) -> String {
     let Counts { faults, never_acted, proposed, malformed, decisions, held_steps, .. } =
         results.settings.iter().map(|one| one.all.counts).fold(Counts::default(), Counts::plus);
     let mut lines = Vec::new();
@@ -107,8 +117,7 @@ fn remarks(results: &Results) -> String {
     }
     if malformed > 0 {
         lines.push(format!(
-            "Malformed candidates: {} of {proposed}; the robot held still in {held_steps} of {decisions} steps.",
-            malformed
+            "Malformed candidates: {malformed} of {proposed}; the robot held still in {held_steps} of {decisions} steps."
         ));
     }
     if results.settings.iter().any(|one| one.setting.strategy == Strategy::Sample) {
@@ -117,7 +126,7 @@ fn remarks(results: &Results) -> String {
                 .to_owned(),
         );
     }
-    lines.iter().map(|line| format!("{line}\n")).collect()
+    lines.iter().map(|line| wrapped(line, columns)).collect()
 }
 
 /// What all say, if they say the same.

@@ -33,10 +33,7 @@ pub fn matching(asked: &[TaskId], offered: &[TaskId]) -> Result<Vec<TaskId>> {
         let task = resolve(name, offered).map_err(|nearest| {
             let tip = nearest.map_or_else(String::new, |task| format!("; did you mean {task}?"));
             let names: Vec<String> = offered.iter().map(TaskId::to_string).collect();
-            WrongUsage(format!(
-                "--tasks: expected one of {}, got {name}{tip}",
-                names.join(", ").replace("/default", "")
-            ))
+            WrongUsage(format!("--tasks: expected one of {}, got {name}{tip}", names.join(", ")))
         })?;
         if !tasks.contains(&task) {
             tasks.push(task);
@@ -61,8 +58,8 @@ mod tests {
         assert_eq!(tasks, [offered[1].clone(), offered[0].clone()]);
         let error = matching(&[TaskId::default_of("spon")], &offered).expect_err("misspelt");
         assert!(error.is::<WrongUsage>());
-        let expected = "--tasks: expected one of widowx_stack_cube, widowx_spoon_on_towel, got spon/default; did you mean \
-                        widowx_spoon_on_towel/default?";
+        let expected = "--tasks: expected one of widowx_stack_cube, widowx_spoon_on_towel, got spon; did you mean \
+                        widowx_spoon_on_towel?";
         assert_eq!(error.to_string(), expected);
     }
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use decision::ActionSpace;
-use evaluation::table::aligned;
+use evaluation::table::{COLUMNS_DEFAULT, aligned, wrapped};
 use runtime::servers::Host;
 use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
 use serde::Serialize;
@@ -224,48 +224,54 @@ pub fn table(verifier: &Verifier) -> String {
     let average = phases(held_out, &|view| view.macro_average);
     rows.push([&["  mean of the tasks".to_owned()], average.as_slice()].concat());
     let pooled = phases(held_out, &|view| view.pooled);
-    rows.push(
-        [&["  pooled (rises by telling easy tasks from hard ones)".to_owned()], pooled.as_slice()]
-            .concat(),
-    );
-    format!(
-        "verifier {} for policy {}\nfitted to {} episodes ({} successes, {} steps) in {} passes, stopped by {} ({} successes), held out {} ({} successes, {} steps)\n{}held-out loss {}, Brier score {}, calibration error {} ({} bins)\n",
-        short(verifier.digest()),
-        short(policy),
-        data.training_episodes,
-        data.training_successes,
-        data.training_samples,
-        data.epochs,
-        data.validation_episodes,
-        data.validation_successes,
-        data.held_out_episodes,
-        data.held_out_successes,
-        data.held_out_samples,
+    rows.push([&["  pooled".to_owned()], pooled.as_slice()].concat());
+    let figures = [
+        format!("verifier {} for policy {}\n", short(verifier.digest()), short(policy)),
+        ranking_text(verifier),
+        format!(
+            "fitted to {} episodes ({} successes, {} steps) in {} epochs\n",
+            data.training_episodes, data.training_successes, data.training_samples, data.epochs
+        ),
+        format!(
+            "early stopping on {} ({} successes), held out {} ({} successes, {} steps)\n",
+            data.validation_episodes,
+            data.validation_successes,
+            data.held_out_episodes,
+            data.held_out_successes,
+            data.held_out_samples
+        ),
         aligned(&rows),
-        figure(held_out.loss),
-        figure(held_out.brier_score),
-        figure(held_out.calibration_error),
-        held_out.reliability.len(),
-    ) + &ranking_text(verifier)
+        "Pooled AUROC also rises when a verifier tells easy tasks from hard ones.\n".to_owned(),
+        format!(
+            "held-out loss {}, Brier score {}, calibration error {} ({} bins)\n",
+            figure(held_out.loss),
+            figure(held_out.brier_score),
+            figure(held_out.calibration_error),
+            held_out.reliability.len()
+        ),
+    ];
+    figures.concat()
 }
 
 /// The gain of the ranking beside that of the medoid, from re-ranking single decisions.
 fn ranking_text(verifier: &Verifier) -> String {
     let Some(ranking) = &verifier.description().ranking else {
-        return format!(
-            "no ranking of candidates: it needs {EPISODES_MIN} training and validation episodes of `rever collect --candidates 5`, and no --plain\n"
+        let text = format!(
+            "no ranking of candidates: it needs {EPISODES_MIN} training and validation episodes of `rever collect --candidates 5`, and no --plain"
         );
+        return wrapped(&text, COLUMNS_DEFAULT);
     };
     let gain = |gain: &ReRankingGain| {
         format!("{:+.1} ± {:.1}", gain.percentage_points, gain.standard_error)
     };
-    format!(
-        "ranking, from {} episodes ({} decisions): estimated gain from re-ranking single decisions {} percentage points, the medoid's {} (cross-fitted, ± one standard error)\n",
-        ranking.episodes,
-        ranking.decisions,
+    let text = format!(
+        "estimated gain from re-ranking single decisions: {} percentage points; of the medoid: {} (cross-fitted, ± one standard error, {} decisions of {} episodes)",
         gain(&ranking.gain),
         gain(&ranking.medoid_gain),
-    )
+        ranking.decisions,
+        ranking.episodes,
+    );
+    wrapped(&text, COLUMNS_DEFAULT)
 }
 
 fn figure(value: Option<f64>) -> String {
@@ -358,8 +364,9 @@ mod tests {
         assert_eq!(cells("mean of the tasks"), ["1.000"; 4], "{table}");
         assert!(table.contains("for policy cafecafecafe\n"), "{table}");
         let fitted = "fitted to 21 episodes (14 successes, 840 steps) in ";
-        let others = ", stopped by 3 (2 successes), held out 6 (4 successes, 240 steps)\n";
+        let others = "early stopping on 3 (2 successes), held out 6 (4 successes, 240 steps)\n";
         assert!(table.contains(fitted) && table.contains(others), "{table}");
+        assert!(table.lines().all(|line| line.chars().count() <= COLUMNS_DEFAULT), "{table}");
     }
 
     #[test]
