@@ -78,21 +78,40 @@ impl Copied {
         files
     }
 
+    /// What pip leaves of a wheel that requires this package: a record, and the Python beside the program.
+    fn install_wheel(&self, requirement: &str) -> PathBuf {
+        let packages = self.path("lib/python3.99/site-packages");
+        let record = packages.join("rever-0.0.0.dist-info");
+        std::fs::create_dir_all(&record).expect("folders can be made");
+        let metadata = format!(
+            "Metadata-Version: 2.4\nName: rever\nVersion: 0.0.0\nRequires-Dist: {requirement}\n"
+        );
+        std::fs::write(record.join("METADATA"), metadata).expect("a file can be written");
+        let beside = self.path("bin/python3");
+        let (packages, python) = (packages.display(), python().python.display());
+        let script = format!("PYTHONPATH=\"$PYTHONPATH:{packages}\" exec {python} \"$@\"");
+        write_program(&beside, &script);
+        beside
+    }
+
     /// A program that says that it was asked, and does nothing; all of them come first on the returned PATH.
     fn decoys(&self, names: &[&str]) -> std::ffi::OsString {
         let folder = self.path("decoys");
         std::fs::create_dir(&folder).expect("a folder can be made");
         for name in names {
-            let script =
-                format!("#!/bin/sh\necho {name} \"$@\" >> {}\n", self.path("asked").display());
-            std::fs::write(folder.join(name), script).expect("a script can be written");
-            let mode = std::fs::Permissions::from_mode(0o755);
-            std::fs::set_permissions(folder.join(name), mode).expect("it can be run");
+            let script = format!("echo {name} \"$@\" >> {}", self.path("asked").display());
+            write_program(&folder.join(name), &script);
         }
         let path = std::env::var_os("PATH").expect("there is a PATH");
         let folders = [folder].into_iter().chain(std::env::split_paths(&path));
         std::env::join_paths(folders).expect("a PATH")
     }
+}
+
+fn write_program(file: &Path, script: &str) {
+    std::fs::write(file, format!("#!/bin/sh\n{script}\n")).expect("a script can be written");
+    let mode = std::fs::Permissions::from_mode(0o755);
+    std::fs::set_permissions(file, mode).expect("it can be run");
 }
 
 fn assert_success(output: &Output) {
@@ -143,6 +162,53 @@ fn doctor_finds_a_machine_ready_and_leaves_it_as_it_is() {
     let output = run(copied.command().args(["doctor", "--python"]).arg(python));
     assert_success(&output);
     assert_eq!(copied.files(), before);
+}
+
+#[test]
+fn the_python_that_a_wheel_was_installed_into_runs_the_servers() {
+    let copied = Copied::new();
+    let python = copied.install_wheel("mujoco==3.8.0");
+    let before = copied.files();
+    let output = run(copied.command().arg("doctor"));
+    assert_success(&output);
+    let said = text(&output);
+    assert!(said.contains(&format!("({})", python.display())), "{said}");
+    assert_eq!(copied.files(), before);
+}
+
+#[test]
+fn a_python_with_other_packages_than_its_wheel_requires_is_named_and_not_used() {
+    let copied = Copied::new();
+    let python = copied.install_wheel("mujoco==0.1");
+    let said = text(&run(copied.command().arg("doctor")));
+    let reason = format!(
+        "the Python that rever was installed into ({}) cannot run servers: packages differ: mujoco==0.1 (found 3.8.0)",
+        python.display()
+    );
+    assert!(said.contains(&reason), "{said}");
+    assert!(said.contains("there is no Python environment"), "{said}");
+}
+
+#[test]
+fn a_named_python_that_cannot_run_servers_is_refused_with_a_hint() {
+    let copied = Copied::new();
+    let bare = copied.path("bare-python");
+    write_program(&bare, &format!("exec {} -S \"$@\"", python().python.display()));
+    for (named, expected) in [
+        (bare, "lacks mujoco, numpy, gymnasium, zenoh, msgpack: leave --python out"),
+        ("/bin/false".into(), "expected a Python, got a program with exit status: 1"),
+        ("/nowhere/python".into(), "expected a Python: No such file or directory"),
+    ] {
+        let output = run(copied.command().args(["doctor", "--python"]).arg(&named));
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        let fault = format!("FAULT python      --python {}: ", named.display());
+        assert!(said.contains(&fault) && said.contains(expected), "{said}");
+    }
+    let mut evaluate = copied.command();
+    evaluate.args(["evaluate", "--strategies=greedy", "--episodes=1", "--python"]);
+    let said = text(&run(evaluate.arg(copied.path("bare-python"))));
+    assert!(said.contains("-m pip install -r ") && said.contains("requirements.lock"), "{said}");
 }
 
 #[test]

@@ -1,8 +1,8 @@
-"""Actions between the world's convention, OpenVLA's, and bins.
+"""Conversion of actions between the environment's convention, OpenVLA's convention, and bins.
 
-World: dx dy dz in metres, a rotation vector in radians, gripper +1 open and -1 closed.
+Environment: dx dy dz in metres, a rotation vector in radians, gripper +1 open and -1 closed.
 OpenVLA: the same translation, roll pitch yaw (sxyz, radians), gripper 1 open and 0 closed; the
-first six scaled so that the 1 % and 99 % quantiles become -1 and 1.
+first six are scaled so that the 1 % and 99 % quantiles become -1 and 1.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ EDGES: Array = np.linspace(-1.0, 1.0, BINS)
 CENTRES: Array = (EDGES[:-1] + EDGES[1:]) / 2.0
 # The first six are scaled by their quantiles, the gripper is not.
 MASK = (True, True, True, True, True, True, False)
-# Half the least span of a scaled dimension: metres, then radians. The demonstrations hardly ever
-# roll or pitch; without a floor their numerical noise would fill all 256 bins.
+# Half of the minimum span of a scaled dimension: metres, then radians. The demonstrations hardly
+# ever roll or pitch; without a minimum their numerical noise would fill all 256 bins.
 SPAN_FLOOR: Array = np.array([0.005, 0.005, 0.005, 0.05, 0.05, 0.05])
 
 
@@ -39,7 +39,7 @@ class Statistics:
 
     @classmethod
     def measure(cls, actions: Array) -> Statistics:
-        """Over (frames, 7) actions in OpenVLA's convention."""
+        """Statistics of (frames, 7) actions in OpenVLA's convention."""
         q01, q99 = np.quantile(actions, [0.01, 0.99], axis=0)
         q01[:6] = np.minimum(q01[:6], -SPAN_FLOOR)
         q99[:6] = np.maximum(q99[:6], SPAN_FLOOR)
@@ -70,14 +70,14 @@ def digits_from_actions(actions: Array, statistics: Statistics) -> NDArray[np.in
 
 
 def actions_from_digits(digits: NDArray[np.int64], statistics: Statistics) -> Array:
-    """(frames, 7) digits 1..256 -> OpenVLA's convention; 255 and 256 share the last centre."""
+    """(frames, 7) digits 1..256 -> OpenVLA's convention; 255 and 256 have the same centre."""
     centres = CENTRES[np.clip(digits - 1, 0, BINS - 2)]
     low, high = np.array(statistics.q01), np.array(statistics.q99)
     return np.where(MASK, 0.5 * (centres + 1.0) * (high - low) + low, centres)
 
 
 def model_from_world(actions: Array) -> Array:
-    """World convention -> OpenVLA's, (frames, 7)."""
+    """Environment's convention -> OpenVLA's, (frames, 7)."""
     result = np.array(actions, dtype=np.float64)
     result[:, 3:6] = euler_from_matrix(matrix_from_vector(actions[:, 3:6]))
     result[:, 6] = actions[:, 6] > 0.0
@@ -85,7 +85,7 @@ def model_from_world(actions: Array) -> Array:
 
 
 def world_from_model(actions: Array) -> Array:
-    """OpenVLA's convention -> the world's, (frames, 7)."""
+    """OpenVLA's convention -> the environment's, (frames, 7)."""
     result = np.array(actions, dtype=np.float64)
     result[:, 3:6] = vector_from_matrix(matrix_from_euler(actions[:, 3:6]))
     result[:, 6] = np.where(actions[:, 6] > 0.5, 1.0, -1.0)
@@ -104,7 +104,7 @@ def matrix_from_vector(vectors: Array) -> Array:
 
 
 def vector_from_matrix(matrices: Array) -> Array:
-    """Valid below half a turn, far above any action's range."""
+    """Rotation vectors of rotation matrices, valid below half a turn, far above any action."""
     sine = 0.5 * np.stack(
         [
             matrices[:, 2, 1] - matrices[:, 1, 2],
@@ -121,7 +121,7 @@ def vector_from_matrix(matrices: Array) -> Array:
 
 
 def matrix_from_euler(angles: Array) -> Array:
-    """Roll, pitch, yaw about the fixed x, y, z axes in this order (sxyz)."""
+    """Roll, pitch and yaw about the fixed x, y and z axes in this order (sxyz)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles).T, np.sin(angles).T
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],

@@ -1,9 +1,10 @@
-"""Makes decisions with PyTorch for `rever bench decision --compare`, which starts it.
+"""The PyTorch side of `rever bench decision --compare`, which starts this program.
 
 python agent/training/bench.py POLICY OBSERVATIONS
 
-Reads one JSON request per line, answers with its milliseconds. The tokens come with the request,
-so that both sides do the same steps; a token is drawn all the same. Nothing is parsed or scored.
+Reads one JSON request per line and answers with the milliseconds that it took. The request has the
+tokens, so that both sides do the same steps; the sampling of each token is timed as well. Nothing
+is parsed or scored.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from torch.nn import functional
 import checkpoint
 from network import Network, rotary_table, rotate
 
-# Room for a completion in the caches.
+# Cache positions reserved for a completion.
 TOKENS_MAX = 48
 
 Cache = tuple[Tensor, Tensor]  # keys and values: (layers, batch, heads, positions, head)
@@ -40,10 +41,10 @@ def main() -> None:
             images.append(file.get_tensor(f"{index}.image")[None])
             prompt = policy.tokenizer.prompt(metadata[f"{index}.instruction"])
             prompts.append(torch.tensor([prompt]))
-    # Every number of candidates is compiled for itself, as fast as it can be.
+    # Each number of candidates is compiled separately, for the best speed.
     dynamo.config.recompile_limit = 64
-    # Longer attention and a mask in place of a slice is what lets a step be compiled once.
-    # A compiled step has one shape, so caches have room for the longest prompt and a completion.
+    # Attention over the whole cache with a mask, instead of a slice, needs only one compilation.
+    # A compiled step has one shape: caches have room for the longest prompt and a completion.
     patches = policy.network.config.vision.patches
     positions = patches + max(prompt.shape[1] for prompt in prompts) + TOKENS_MAX
     eager = Decoding(policy.network, positions, lambda function: function, fixed=False)
@@ -55,7 +56,7 @@ def main() -> None:
         try:
             decoding.decide(images[0], prompts[0], torch.zeros(2, 2, dtype=torch.long))
             settings[name] = decoding
-        except Exception as error:  # whatever a compiler or its tool chain raises
+        except Exception as error:  # compilers and their tool chains raise errors of many types
             broken.append(f"{name}: {str(error).strip().splitlines()[0]}")
     answer(
         version=torch.__version__,
@@ -76,7 +77,7 @@ def answer(**values: object) -> None:
 
 
 def padded(rows: list[list[int]]) -> list[list[int]]:
-    """Malformed candidates may end early; PyTorch's batch runs to the longest."""
+    """Pads candidates that ended early, malformed ones: PyTorch's batch runs to the longest."""
     longest = max(len(row) for row in rows)
     return [row + [row[-1]] * (longest - len(row)) for row in rows]
 

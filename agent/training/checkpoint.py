@@ -36,7 +36,7 @@ def write(
     statistics: Statistics,
     dtype: torch.dtype,
 ) -> None:
-    """Writes the three files; each appears whole or not at all."""
+    """Writes the three files, each atomically."""
     directory.mkdir(parents=True, exist_ok=True)
     config = config_json(network.config, statistics, dtype)
     replace(directory / "config.json", json.dumps(config, indent=2) + "\n")
@@ -51,7 +51,7 @@ def write(
 
 
 def read(directory: Path) -> Checkpoint:
-    """The weights come back in float32 whatever their type on disk."""
+    """Loads a checkpoint; the weights are float32, whatever their type on disk."""
     config = json.loads((directory / "config.json").read_text(encoding="utf-8"))
     weights = load_file(directory / "model.safetensors")
     network = Network(network_config(config, dead_blocks(config, weights)))
@@ -64,7 +64,7 @@ def read(directory: Path) -> Checkpoint:
 def config_json(
     config: NetworkConfig, statistics: Statistics, dtype: torch.dtype
 ) -> dict[str, Any]:
-    """OpenVLA's config.json, plus full descriptions of towers that no timm name stands for."""
+    """OpenVLA's config.json, with full descriptions of vision towers that timm does not name."""
     fused = config.fused_vision is not None
     towers = [config.vision] + ([config.fused_vision] if config.fused_vision else [])
     text = {

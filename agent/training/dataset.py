@@ -1,4 +1,4 @@
-"""Demonstrations as one table of frames: image, prompt, completion; and how frames are drawn."""
+"""Demonstrations as one table of frames (image, prompt, completion), and sampling of frames."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from actions import DIMENSIONS, Statistics, digits_from_actions, model_from_worl
 from demonstration import Demonstration
 from tokenizer import ACTION_BINS, COORDINATE_LEVELS, END, FIRST_COORDINATE_ID, Tokenizer
 
-# The first frames of a subtask look almost like the last of the one before; drawn more often, so
-# that a policy that acts by the likeliest answer goes on instead of waiting for ever.
+# Oversampling of the first frames of a subtask: they look almost like the last ones of the previous
+# subtask, and a greedy policy would otherwise repeat that one forever.
 TRANSITION_WEIGHT = 2.0
-# Roll, pitch and gripper take few values; only exact answers are right for them.
+# Roll, pitch and gripper have few values; their targets are hard.
 EXACT_DIMENSIONS = (3, 4, 6)
 
 
 @dataclass(frozen=True)
 class Frames:
-    """F frames; prompts and completions all have one length, checked when they are read."""
+    """F frames. All prompts have one length, and all completions; checked when they are read."""
 
     # (F, 128, 128, 3)
     image: NDArray[np.uint8]
@@ -33,17 +33,17 @@ class Frames:
     prompt: NDArray[np.int64]
     # (F, completion tokens): reasoning, 7 action tokens, `</s>`
     completion: NDArray[np.int64]
-    # (F, 7) in the world's convention
+    # (F, 7) in the environment's convention
     action: NDArray[np.float32]
     task: list[str]
-    # (F,) drawing weight
+    # (F,) sampling weight
     weight: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.image)
 
     def draw(self, count: int, seed: int, step: int) -> NDArray[np.int64]:
-        """Indices of a batch; a function of seed and step alone, so that a resumed run agrees."""
+        """Indices of a batch: a function of seed and step only, so that runs can be resumed."""
         generator = np.random.default_rng([seed, step])
         return np.searchsorted(np.cumsum(self.weight), generator.random(count)).astype(np.int64)
 
@@ -91,7 +91,7 @@ def tabulate(
 
 
 def weigh(demonstrations: Sequence[Demonstration]) -> NDArray[np.float64]:
-    """Every task alike, transitions more often; sums to 1."""
+    """Sampling weights, sum 1: equal for all tasks, larger for the first frames of subtasks."""
     names = np.array([episode.task for episode in demonstrations for _ in episode.reasoning])
     subtasks = [[subtask(text) for text in episode.reasoning] for episode in demonstrations]
     changes = [now != before for row in subtasks for before, now in pairs(row)]
@@ -107,17 +107,17 @@ def subtask(text: str) -> str:
 
 
 def pairs(row: list[str]) -> Iterator[tuple[str, str]]:
-    """Each entry with the one before; the first with itself."""
+    """Each entry paired with the previous one; the first with itself."""
     return zip([row[0], *row[:-1]], row, strict=True)
 
 
 def soft_targets(
     tokenizer: Tokenizer, rows: int, coordinate_bins: float, action_bins: float
 ) -> Tensor:
-    """(tokens, rows): what the model should answer where each token is right.
+    """Target distributions (tokens, rows) for each correct token.
 
-    Coordinates and action bins are Gaussians over their neighbours, of the given deviations in
-    bins: a near miss is nearly right. All else is certain.
+    Coordinates and action bins have Gaussians over their neighbours with the given standard
+    deviations in bins, because a near miss is nearly right. All other targets are hard.
     """
     table = torch.eye(tokenizer.size, rows)
     for first, count, deviation in scales(tokenizer, coordinate_bins, action_bins):
@@ -132,7 +132,7 @@ def soft_targets(
 def scales(
     tokenizer: Tokenizer, coordinate_bins: float, action_bins: float
 ) -> list[tuple[int, int, float]]:
-    """First id, count of ids and deviation in bins, of each run of ids that form a scale."""
+    """First id, number of ids and deviation in bins of each range of ids that form a scale."""
     coordinates = [
         (FIRST_COORDINATE_ID + form * COORDINATE_LEVELS, COORDINATE_LEVELS, coordinate_bins)
         for form in range(3)
@@ -141,7 +141,7 @@ def scales(
 
 
 def exact_places(completion_tokens: int) -> NDArray[np.int64]:
-    """Places of the action tokens whose answers are exact."""
+    """Positions of the action tokens with hard targets."""
     first = completion_tokens - 1 - DIMENSIONS
     return np.array([first + dimension for dimension in EXACT_DIMENSIONS])
 
@@ -151,10 +151,10 @@ def blur(
     runs: list[tuple[int, int, float]],
     generator: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Completions as the model's own samples read: values moved by the targets' deviation.
+    """Completions with noise like that of the model's own samples, against exposure bias.
 
-    Trained on true values only, it would meet its own slightly wrong ones for the first time when
-    it acts, and trust them more than the image.
+    A model trained only on exact values would see its own slightly wrong values for the first time
+    when it acts, and trust them more than the image.
     """
     result = completion.copy()
     for first, count, deviation in runs:
@@ -167,7 +167,7 @@ def blur(
 
 
 def position_weights(completion_tokens: int, action_weight: float) -> Tensor:
-    """(completion tokens,): where and how far to move weighs more than words; the mean is 1."""
+    """Loss weights (completion tokens,), mean 1: coordinates and actions weigh more than words."""
     weight = torch.ones(completion_tokens)
     weight[-1 - DIMENSIONS : -1] = action_weight
     weight[exact_places(completion_tokens)] = 1.0

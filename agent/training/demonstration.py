@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Demonstration:
-    """T observations of one episode and what the expert thinks and does at each."""
+    """T observations of one episode with the expert's reasoning and action for each."""
 
     task: str
     instruction: str
     seed: int
     # (T, 128, 128, 3)
     image: NDArray[np.uint8]
-    # (T, 7), the noise-free label in the world's convention
+    # (T, 7), the noise-free label in the environment's convention
     expert_action: NDArray[np.float32]
     # T texts, from " TASK:" to " ACTION:"
     reasoning: list[str]
@@ -32,8 +32,8 @@ class Demonstration:
                 seed=int(arrays["seed"]),
                 image=arrays["image"],
                 expert_action=arrays["expert_action"],
-                # The file's text stops before the action; the model's completion starts with a
-                # space and goes on to the action.
+                # The text in the file ends before the action; the model's completion starts with a
+                # space and includes the action.
                 reasoning=[f" {text} ACTION:" for text in arrays["reasoning"]],
             )
 

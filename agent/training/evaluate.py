@@ -1,4 +1,4 @@
-"""What a checkpoint knows on held-out episodes: with the truth as context, and on its own text.
+"""Measures a checkpoint on held-out episodes: teacher-forced, and on its own greedy text.
 
 python agent/training/evaluate.py --model DIR --demonstrations DIR [--json FILE]
 """
@@ -27,23 +27,23 @@ BATCH = 64
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Mean errors of the most likely token at each place."""
+    """Mean errors of the most likely token at each position."""
 
     frames: int
-    # Of the words (not coordinates, not actions).
+    # Accuracy of the words (without coordinates and actions).
     phrase_accuracy: float
-    # Of the MOVE phrase alone.
+    # Accuracy of the MOVE phrase.
     move_accuracy: float
-    # In pixels of the 256-pixel square, mean over coordinates.
+    # Pixels of the 256-pixel square, mean over coordinates.
     box_error_pixels: float
     gripper_error_pixels: float
     # Mean absolute error over x, y, z.
     translation_error_mm: float
-    # Mean absolute error of the turn about z.
+    # Mean absolute error of the rotation about z.
     yaw_error_degrees: float
     gripper_accuracy: float
-    # Cross-entropy of the words, coordinates and actions against hard targets, nats a token;
-    # none where the model read its own text.
+    # Cross-entropy of words, coordinates and actions against hard targets, nats per token; None if
+    # the model reads its own text.
     loss: float | None
 
 
@@ -51,7 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--demonstrations", type=Path, required=True)
-    parser.add_argument("--frames", type=int, default=1_000_000, help="at most this many")
+    parser.add_argument("--frames", type=int, default=1_000_000, help="maximum number of frames")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     policy = checkpoint.read(arguments.model)
@@ -78,7 +78,7 @@ def measure_held_out(
     frames: dataset.Frames,
     count: int,
 ) -> HeldOut:
-    """Over at most `count` frames, evenly spread."""
+    """Measures at most `count` evenly spaced frames."""
     chosen = spread(frames, count)
     start = network.config.vision.patches + frames.prompt.shape[1] - 1
     answers, losses = [], []
@@ -101,7 +101,7 @@ def measure_own_text(
     frames: dataset.Frames,
     count: int,
 ) -> HeldOut:
-    """Greedy completions, each token read back by the next: what the policy does when it acts."""
+    """Greedy completions: each token is the input of the next, as when the policy acts."""
     chosen = spread(frames, count)
     answers = []
     for indices in np.array_split(chosen, max(1, len(chosen) // BATCH)):
@@ -114,7 +114,7 @@ def measure_own_text(
 
 
 def spread(frames: dataset.Frames, count: int) -> NDArray[np.int64]:
-    """Indices of at most `count` frames, evenly spread."""
+    """Indices of at most `count` evenly spaced frames."""
     places = np.linspace(0, len(frames) - 1, min(count, len(frames)))
     return np.unique(places.astype(np.int64))
 
@@ -127,16 +127,16 @@ def compare(
     statistics: Statistics,
     loss: float | None,
 ) -> HeldOut:
-    # The kind of token at a place is the same in every completion.
+    # The kind of token at a position is the same in all completions.
     row = truth[0]
     coordinates = is_coordinate(row)
     places = np.flatnonzero(coordinates)
     boxes, gripper = places[:-2], places[-2:]
     words = np.flatnonzero(~coordinates)[: -DIMENSIONS - 1]
-    # " MOVE ..." stands two before the gripper's first coordinate: MOVE, GRIPPER POSITION, x, y.
+    # " MOVE ..." is two tokens before the gripper's first coordinate: MOVE, GRIPPER POSITION, x, y.
     move = gripper[0] - 2
     actions = slice(-1 - DIMENSIONS, -1)
-    # An answer that is no action id would be malformed; here it counts as the nearest bin.
+    # A token that is no action id would be malformed; here it counts as the nearest bin.
     digits = np.clip(tokenizer.size - answer[:, actions], 1, 256)
     decoded = world_from_model(actions_from_digits(digits, statistics))
     error = np.abs(decoded - action)
@@ -159,7 +159,7 @@ def is_coordinate(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def coordinate_error(answer: NDArray[np.int64], truth: NDArray[np.int64]) -> float:
-    """Pixels; an answer of another kind counts as far away as the square is wide."""
+    """Errors in pixels; a token that is no coordinate counts as the width of the square."""
     level = (answer - FIRST_COORDINATE_ID) % COORDINATE_LEVELS
     wanted = (truth - FIRST_COORDINATE_ID) % COORDINATE_LEVELS
     error = np.where(is_coordinate(answer), np.abs(level - wanted), COORDINATE_LEVELS)

@@ -1,6 +1,6 @@
-"""Writes the golden values that prove another implementation of the network equal to this one.
+"""Writes golden values, to test another implementation of the network against this one.
 
-python agent/training/fixtures.py tiny    random small weights, every layer's output
+python agent/training/fixtures.py tiny    random small weights, output of every layer
 python agent/training/fixtures.py shipped the trained model on recorded observations
 """
 
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def tiny_configs() -> dict[str, NetworkConfig]:
-    """One tower as the shipped model has; two towers with all that OpenVLA-7B's use."""
+    """One vision tower, as in the shipped model; or two with all features of OpenVLA-7B's."""
     plain = TowerConfig(image_size=32, patch_size=8, embed_dim=24, depth=3, num_heads=3)
     dino = TowerConfig(
         image_size=28,
@@ -86,7 +86,7 @@ def tiny_tokenizer() -> Tokenizer:
 
 
 def write_tiny(directory: Path, config: NetworkConfig, seed: int) -> None:
-    """Random weights large enough that every layer matters to the fourth digit."""
+    """Random weights, large enough that each layer changes the fourth digit of the output."""
     generator = torch.Generator().manual_seed(seed)
     network = Network(config).eval()
     with torch.no_grad():
@@ -96,7 +96,7 @@ def write_tiny(directory: Path, config: NetworkConfig, seed: int) -> None:
             centred = "norm" not in name and not name.endswith("scale_factor")
             centred = centred or name.endswith("bias")
             parameter.copy_(float(not centred) + scale * noise)
-    # A symmetric made-up range in every scaled dimension.
+    # An arbitrary symmetric range in each scaled dimension.
     statistics = Statistics(
         q01=[-0.03, -0.04, -0.02, -0.1, -0.1, -0.2, 0.0],
         q99=[0.03, 0.04, 0.04, 0.1, 0.1, 0.2, 1.0],
@@ -121,7 +121,7 @@ def write_tiny(directory: Path, config: NetworkConfig, seed: int) -> None:
 
 
 def record_activations(network: Network, image: Tensor, tokens: list[int]) -> dict[str, Tensor]:
-    """Output of every block and layer, by module name; batch dimension removed."""
+    """Outputs of all blocks and layers by module name, without the batch dimension."""
     result: dict[str, Tensor] = {"image": image}
     decoder = network.language_model.model
 
@@ -147,7 +147,7 @@ def record_activations(network: Network, image: Tensor, tokens: list[int]) -> di
 
 
 def greedy(network: Network, image: Tensor, prompt: list[int]) -> list[int]:
-    """By full recomputation, so that no cache can be wrong; ends with `</s>` or at the limit."""
+    """Greedy tokens without a cache, up to `</s>` or the limit."""
     tokens = list(prompt)
     with torch.no_grad():
         while len(tokens) - len(prompt) < TOKENS_MAX and tokens[-1] != END:
@@ -157,7 +157,7 @@ def greedy(network: Network, image: Tensor, prompt: list[int]) -> list[int]:
 
 
 def write_shipped(path: Path, demonstrations: Path) -> None:
-    """Two held-out observations of each task, one early and one in the middle of the episode."""
+    """Two held-out observations of each task: an early one and one in mid-episode."""
     policy = checkpoint.read(MODEL)
     result: dict[str, Tensor] = {}
     metadata: dict[str, str] = {}
@@ -169,7 +169,7 @@ def write_shipped(path: Path, demonstrations: Path) -> None:
             image = torch.from_numpy(np.array(episode.image[frame]))
             prompt = policy.tokenizer.prompt(episode.instruction)
             tokens = greedy(policy.network, image, prompt)
-            # Logits that choose each generated token: from the prompt's last position on.
+            # Logits of each generated token: from the last position of the prompt on.
             start = policy.network.config.vision.patches + len(prompt) - 1
             with torch.no_grad():
                 sequence = torch.tensor([[*prompt, *tokens[:-1]]])

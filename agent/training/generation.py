@@ -1,4 +1,4 @@
-"""Batched generation with a cache of keys and values, for measuring a checkpoint from Python."""
+"""Batched generation with a key-value cache, to measure a checkpoint from Python."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def generate(
 ) -> Tensor:
     """(batch, height, width, 3) and (batch, prompt) -> (batch, tokens); temperature 0 is greedy.
 
-    Always draws `tokens` tokens: completions of one policy all have the same length.
+    Always samples `tokens` tokens: all completions of a policy have the same length.
     """
     decoder = network.language_model.model
     embedded = network.embed(image, prompt)
@@ -57,7 +57,7 @@ def generate(
 
 
 def extend(decoder: Decoder, cache: Cache, x: Tensor) -> Tensor:
-    """(batch, new positions, hidden) -> final-norm states; the cache grows by the positions."""
+    """(batch, new positions, hidden) -> final-norm states; appends the positions to the cache."""
     first, last = cache.length, cache.length + x.shape[1]
     cosine, sine = rotary_table(last, decoder.config, x.device)
     mask = torch.full((last, last), -torch.inf).triu(1)[first:]

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-# Means and deviations of the channels in 0..1: the 7 B checkpoints' own values.
+# Means and deviations of the channels in 0..1, from the 7 B checkpoints.
 SIGLIP_NORMALISATION = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
 DINO_NORMALISATION = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 
@@ -69,12 +69,12 @@ class DecoderConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The whole network: one tower, or two of which the first is DINO-like (fused)."""
+    """The whole network: one vision tower, or two, the first of them DINO-like (fused)."""
 
     vision: TowerConfig
     text: DecoderConfig
     fused_vision: TowerConfig | None = None
-    # Never run; a checkpoint may carry them all the same, as OpenVLA's do.
+    # Unused; checkpoints may have them anyway, as OpenVLA's do.
     dead_blocks: int = 0
 
 
@@ -138,7 +138,7 @@ class Block(nn.Module):
 
 
 class PatchEmbed(nn.Module):
-    """A linear map of each patch, stored as timm stores it: as a convolution."""
+    """A linear map of each patch, stored as a convolution, as in timm."""
 
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
@@ -189,7 +189,7 @@ class Tower(nn.Module):
 
 
 class VisionBackbone(nn.Module):
-    """One tower, or two whose features are joined along the width, DINO's first."""
+    """One tower, or two with concatenated features, DINO's first."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -214,7 +214,7 @@ class VisionBackbone(nn.Module):
 
 
 class Projector(nn.Module):
-    """Two layers for one tower; three, the first four times wider, for fused towers."""
+    """Two layers for one tower; three for fused towers, the first four times wider."""
 
     def __init__(self, vision_width: int, hidden: int, fused: bool) -> None:
         super().__init__()
@@ -253,7 +253,7 @@ class SelfAttention(nn.Module):
         self.o_proj = nn.Linear(config.hidden_size, config.hidden_size, bias=False)
 
     def forward(self, x: Tensor, rotary: tuple[Tensor, Tensor], mask: Tensor, start: int) -> Tensor:
-        """Outputs the positions from `start` on; all positions serve as keys and values."""
+        """Outputs of the positions from `start` on; all positions are keys and values."""
         batch, length, width = x.shape
         head = self.config.head_size
         cosine, sine = rotary
@@ -314,7 +314,7 @@ class Decoder(nn.Module):
         mask = torch.full((length, length), -torch.inf, device=x.device).triu(1)
         last = len(self.layers) - 1
         for index, layer in enumerate(self.layers):
-            # Nothing after the last layer mixes positions, so it needs only those asked for.
+            # Nothing after the last layer mixes positions: it computes only the requested ones.
             x = layer(x, rotary, mask, start if index == last else 0)
         result: Tensor = self.norm(x)
         return result
@@ -365,7 +365,7 @@ def attend(query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None) -> Te
 
 
 def rotary_table(length: int, config: DecoderConfig, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Cosine and sine, (length, head), both halves of a head turned by the same angles."""
+    """Cosine and sine, (length, head); the same angles for both halves of a head."""
     steps = torch.arange(0, config.head_size, 2, device=device).float() / config.head_size
     angles = torch.outer(
         torch.arange(length, device=device).float(), 1.0 / config.rope_theta**steps
@@ -385,7 +385,7 @@ def normalise(pixels: Tensor, normalisation: tuple[tuple[float, ...], tuple[floa
 
 
 def initialise(network: Network, config: NetworkConfig) -> None:
-    """Normal weights of deviation 0.02; what closes a residual branch is scaled by its depth."""
+    """Normal weights, deviation 0.02; the last ones of residual branches are scaled by depth."""
     depths = (config.vision.depth, config.text.num_hidden_layers)
     for name, parameter in network.named_parameters():
         if name.endswith("bias"):

@@ -1,7 +1,7 @@
-"""Muon for the matrices inside the network, Adam for everything else.
+"""Optimizer: Muon for the matrices inside the network, Adam for all other weights.
 
-Muon replaces a matrix's momentum by the nearest orthogonal matrix (Jordan et al., 2024), found by
-Newton-Schulz iterations; its step is scaled to the size of Adam's (Liu et al., 2025), so that both
+Muon replaces the momentum of a matrix by the nearest orthogonal matrix (Jordan et al., 2024), with
+Newton-Schulz iterations. Its step is scaled to the size of Adam's (Liu et al., 2025), so that both
 share one learning rate schedule.
 """
 
@@ -20,7 +20,7 @@ ADAM_STEP_SIZE = 0.2
 
 
 class Muon(torch.optim.Optimizer):
-    """Matrices only. A fused query-key-value weight counts as three matrices."""
+    """Muon, for matrices only. A fused query-key-value weight counts as three matrices."""
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class Muon(torch.optim.Optimizer):
             for parameter in group["params"]:
                 buffer = self.state[parameter].setdefault("momentum", torch.zeros_like(parameter))
                 buffer.lerp_(parameter.grad, 1.0 - group["momentum"])
-                # Nesterov's look ahead.
+                # Nesterov momentum.
                 ahead = parameter.grad.lerp(buffer, group["momentum"])
                 parts = self.parts[id(parameter)]
                 # (parts * rows, columns) -> parts x (rows, columns)
@@ -61,9 +61,9 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalise(matrices: Tensor, iterations: int) -> Tensor:
-    """(count, rows, columns): singular values brought near 1, singular vectors kept.
+    """Orthogonalizes (count, rows, columns): singular values near 1, the same singular vectors.
 
-    In bf16 as by Jordan et al.: the singular values are rough anyway, and products are faster.
+    In bf16, as by Jordan et al.: the singular values are approximate anyway.
     """
     tall = matrices.shape[1] > matrices.shape[2]
     x = (matrices.transpose(1, 2) if tall else matrices).bfloat16()
@@ -77,7 +77,7 @@ def orthogonalise(matrices: Tensor, iterations: int) -> Tensor:
 
 
 def is_inner_matrix(name: str, parameter: nn.Parameter) -> bool:
-    """Embeddings, the head and the patch embedding meet the outside and stay with Adam."""
+    """Whether Muon updates a weight; Adam updates embeddings, the head and the patch embedding."""
     outside = ("embed_tokens", "lm_head", "patch_embed", "pos_embed")
     return parameter.ndim == 2 and not any(part in name for part in outside)
 

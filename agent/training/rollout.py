@@ -1,4 +1,4 @@
-"""Measures a checkpoint in the world, batched over episodes in lockstep, without any server.
+"""Measures a checkpoint in simulation: a batch of episodes in lockstep, without a server.
 
 MUJOCO_GL=egl python agent/training/rollout.py --model DIR [--layouts grid|random]
 """
@@ -23,7 +23,7 @@ from actions import DIMENSIONS, actions_from_digits, world_from_model
 from generation import generate
 from tokenizer import ACTION_BINS, END
 
-# The contract's range of seeds for held-out random layouts.
+# Seeds of the held-out random layouts.
 EVALUATION_SEED = 3_000_000_000
 GRID = 24
 # Reasoning of 17 tokens, 7 action tokens and `</s>`.
@@ -32,7 +32,7 @@ COMPLETION_TOKENS = 25
 
 @dataclass(frozen=True)
 class Row:
-    """One task's result; success as SIMPLER reads it, at the last step."""
+    """The result of one task. Success: at the last step, as in SIMPLER."""
 
     task: str
     episodes: int
@@ -52,7 +52,7 @@ def main() -> None:
         "--tasks", nargs="+", default=[task.name for task in tasks.choose(tasks.load(), None)]
     )
     parser.add_argument("--layouts", choices=["grid", "random"], default="grid")
-    parser.add_argument("--episodes", type=int, default=GRID, help="of each task")
+    parser.add_argument("--episodes", type=int, default=GRID, help="episodes per task")
     parser.add_argument("--temperature", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
@@ -131,7 +131,7 @@ def measure(
 def decode(
     policy: checkpoint.Checkpoint, completion: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Actions in the world's convention; a malformed completion holds still with an open hand."""
+    """Actions in the environment's convention; a malformed completion holds still, gripper open."""
     size = policy.tokenizer.size
     digits = size - completion[:, -1 - DIMENSIONS : -1]
     inside = ((digits >= 1) & (digits <= ACTION_BINS)).all(axis=1)
@@ -151,7 +151,7 @@ def advance(
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
-    """95 % interval of a rate."""
+    """The 95 % Wilson interval of a rate."""
     z = 1.959964
     rate = successes / count
     centre = (rate + z * z / (2 * count)) / (1 + z * z / count)

@@ -1,8 +1,8 @@
-"""The generator's tokenizer: whole phrases, coordinates, bytes for all else, 256 action bins.
+"""The generator's tokenizer: phrases, coordinates, 256 action bins, bytes for all other text.
 
 Ids: 0 `<unk>`, 1 `<s>`, 2 `</s>`, 256 bytes, 3 x 128 coordinates, the phrases, reserved ids up to
 a multiple of 64, and last the action bins as in OpenVLA: bin d (1..256) has id V - d, V being the
-number of tokens. The phrases are added tokens, so the longest one wins at each place.
+number of tokens. The phrases are added tokens: the longest match wins.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ UNKNOWN, BEGIN, END = 0, 1, 2
 ACTION_BINS = 256
 COORDINATE_LEVELS = 128
 COORDINATE_STEP_PIXELS = 2
-# Where a coordinate stands in a list, as text before and after it: first, middle, last.
+# The text before and after a coordinate in a list: first, middle, last.
 COORDINATE_FORMS = ((" [", ""), (", ", ""), (", ", "]"))
 FIRST_COORDINATE_ID = 3 + 256
 VOCABULARY_MULTIPLE = 64
@@ -27,7 +27,7 @@ PROMPT_TEMPLATE = "In: What action should the robot take to {instruction}?\nOut:
 
 
 class Tokenizer:
-    """Text to ids and back, plus the ids of coordinates and action bins."""
+    """Text to ids and back, and the ids of coordinates and action bins."""
 
     def __init__(self, description: dict[str, Any]) -> None:
         self.description = description
@@ -36,7 +36,7 @@ class Tokenizer:
 
     @classmethod
     def build(cls, phrases: Sequence[str], instructions: Sequence[str]) -> Tokenizer:
-        """Phrases are the fixed segments of the reasoning; instructions are in lower case."""
+        """Phrases: the fixed segments of the reasoning. Instructions are in lower case."""
         before, after = PROMPT_TEMPLATE.split("{instruction}")
         added = list(dict.fromkeys([before, after, *instructions, *phrases]))
         tokens = ["<unk>", "<s>", "</s>", *(f"<0x{byte:02X}>" for byte in range(256))]
@@ -50,7 +50,7 @@ class Tokenizer:
         tokens += [f"<reserved{index}>" for index in range(reserved)]
         tokens += [f"<action{digit}>" for digit in range(ACTION_BINS, 0, -1)]
         if len(set(tokens)) != len(tokens):
-            raise ValueError("phrases of the tokenizer: expected distinct texts, got a double")
+            raise ValueError("phrases of the tokenizer: expected distinct texts, got a duplicate")
         return cls(describe(tokens, coordinates + added))
 
     @classmethod
@@ -70,7 +70,7 @@ class Tokenizer:
         return text
 
     def prompt(self, instruction: str) -> list[int]:
-        """The first token and the prompt; the patches go between the first token and the rest."""
+        """The first token and the prompt; the image patches follow the first token."""
         return [BEGIN, *self.encode(PROMPT_TEMPLATE.format(instruction=instruction.lower()))]
 
     def action_id(self, digit: int) -> int:

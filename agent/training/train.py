@@ -3,8 +3,8 @@
     python agent/training/train.py --demonstrations DIR --out DIR --minutes 55
     python agent/training/train.py --demonstrations DIR --out DIR --steps 2000
 
-The same command goes on where an interrupted one was. With `--steps`, the same seed draws the same
-batches and learning rates; with `--minutes`, the rate follows the clock instead.
+Rerun the same command to resume an interrupted run. With `--steps`, the same seed gives the same
+batches and learning rates; with `--minutes`, the learning rate depends on the clock.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tokenizer import Tokenizer
 WARMUP_STEPS = 60
 GRADIENT_NORM_MAX = 1.0
 
-# Image, prompt, the completion as context, the completion as answer.
+# Image, prompt, completion as context, completion as target.
 Loss = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
@@ -63,7 +63,7 @@ class Options:
 
 @dataclass
 class Progress:
-    """What a checkpoint remembers besides weights and optimiser states."""
+    """The progress in a checkpoint, besides weights and optimizer states."""
 
     step: int = 0
     seconds: float = 0.0
@@ -96,7 +96,7 @@ def main() -> None:
 
 
 def network_config(tokenizer: Tokenizer) -> NetworkConfig:
-    """6 used blocks of 192 on 64 patches, 4 decoder layers of 256 (the study had 5)."""
+    """6 used vision blocks of width 192 on 64 patches, 4 decoder layers of width 256."""
     return NetworkConfig(
         vision=TowerConfig(image_size=128, patch_size=16, embed_dim=192, depth=7, num_heads=3),
         text=DecoderConfig(
@@ -162,7 +162,7 @@ class Trainer:
         self.export()
 
     def share(self) -> float:
-        """How much of the budget is spent, 0 to 1."""
+        """The spent fraction of the budget, 0 to 1."""
         if self.options.steps is not None:
             return self.progress.step / self.options.steps
         assert self.options.minutes is not None
@@ -198,7 +198,7 @@ class Trainer:
         print(
             f"step {step:5d}  loss {sum(recent) / len(recent):.4f}  "
             f"{step * self.options.batch / seconds:5.1f} samples/s  "
-            f"{seconds / 60:5.1f} min, {left / 60:5.1f} left",
+            f"{seconds / 60:5.1f} min, {left / 60:5.1f} remaining",
             flush=True,
         )
 
@@ -224,10 +224,10 @@ class Trainer:
             each.load_state_dict(saved)
         if started:
             self.progress = Progress(**state["progress"])
-        print(f"going on from step {self.progress.step} of {path}", flush=True)
+        print(f"resuming from step {self.progress.step} of {path}", flush=True)
 
     def export(self) -> None:
-        """Writes the checkpoint in bf16 and what it can do on held-out frames."""
+        """Writes the checkpoint in bf16 and measures it on held-out frames."""
         directory = self.options.out / "checkpoint"
         checkpoint.write(directory, self.network, self.tokenizer, self.statistics, torch.bfloat16)
         self.network.eval()
@@ -242,10 +242,10 @@ class Trainer:
 def loss_function(
     options: Options, network: Network, tokenizer: Tokenizer, frames: dataset.Frames
 ) -> Loss:
-    """Divergence from the soft targets over completion tokens, in nats; 0 is perfect."""
+    """KL divergence from the soft targets over completion tokens, in nats; 0 is perfect."""
     rows = network.config.text.vocab_size
     soft = dataset.soft_targets(tokenizer, rows, options.coordinate_bins, options.action_bins)
-    # The second half of the table is for places with exact answers.
+    # The second half of the table is for positions with hard targets.
     table = torch.cat([soft, torch.eye(tokenizer.size, rows)])
     half = torch.zeros(frames.completion.shape[1], dtype=torch.int64)
     half[dataset.exact_places(len(half))] = tokenizer.size
@@ -274,32 +274,47 @@ def loss_function(
 
 
 def decay(share: float) -> float:
-    """Constant for the first quarter of the budget, then straight to zero."""
+    """Learning rate factor: 1 for the first quarter of the budget, then linear to 0."""
     return min(1.0, (1.0 - share) / 0.75)
 
 
 def parse(arguments: list[str]) -> Options:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--demonstrations", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
+    add = parser.add_argument
+    add("--demonstrations", type=Path, required=True, help="folder with TASK/SEED.npz")
+    add("--out", type=Path, required=True, help="write the checkpoint to this folder")
     budget = parser.add_mutually_exclusive_group(required=True)
-    budget.add_argument("--minutes", type=float)
-    budget.add_argument("--steps", type=int)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--batch", type=int, default=64)
-    parser.add_argument("--learning-rate", type=float, default=4e-3, help="of the matrices")
-    parser.add_argument("--adam-learning-rate", type=float, default=2e-3, help="of the rest")
-    parser.add_argument("--action-weight", type=float, default=2.0)
-    parser.add_argument("--coordinate-bins", type=float, default=1.0, help="softness of targets")
-    parser.add_argument("--action-bins", type=float, default=2.0, help="softness of targets")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--begin-with", type=Path, help="state.pt of an earlier run")
-    parser.add_argument("--checkpoint-seconds", type=float, default=120.0)
-    parser.add_argument("--evaluate-seconds", type=float, default=300.0)
-    parser.add_argument(
-        "--precision", choices=("bf16", "f32"), default="bf16", help="of products; weights are f32"
+    budget.add_argument("--minutes", type=float, help="train for so many minutes")
+    budget.add_argument("--steps", type=int, help="train for so many steps, reproducibly")
+    add("--seed", type=int, default=0, help="seed of weights and batches (default: 0)")
+    add("--batch", type=int, default=64, help="frames per step (default: 64)")
+    add("--learning-rate", type=float, default=4e-3, help="of Muon (default: 4e-3)")
+    add("--adam-learning-rate", type=float, default=2e-3, help="of Adam (default: 2e-3)")
+    add("--action-weight", type=float, default=2.0, help="loss weight of actions (default: 2)")
+    softness = "standard deviation of the soft targets of {}, in bins (default: {})"
+    add("--coordinate-bins", type=float, default=1.0, help=softness.format("coordinates", 1))
+    add("--action-bins", type=float, default=2.0, help=softness.format("actions", 2))
+    add("--threads", type=int, default=2, help="CPU threads (default: 2)")
+    add("--begin-with", type=Path, help="start from this state.pt of another run")
+    add(
+        "--checkpoint-seconds",
+        type=float,
+        default=120.0,
+        help="interval of saving the state (default: 120)",
     )
-    parser.add_argument("--eager", dest="compiled", action="store_false")
+    add(
+        "--evaluate-seconds",
+        type=float,
+        default=300.0,
+        help="interval of measuring on held-out frames (default: 300)",
+    )
+    add(
+        "--precision",
+        choices=("bf16", "f32"),
+        default="bf16",
+        help="of matrix products; weights are f32 (default: bf16)",
+    )
+    add("--eager", dest="compiled", action="store_false", help="do not compile the network")
     return Options(**vars(parser.parse_args(arguments)))
 
 
