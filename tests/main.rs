@@ -34,6 +34,9 @@ mod local_servers;
 // Evaluations with the models that come with the program: results, kills, faults, the report.
 mod whole_loop;
 
+// The page of a run in a browser.
+mod report_page;
+
 // What decisions cost.
 mod bench;
 

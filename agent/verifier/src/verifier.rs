@@ -13,7 +13,7 @@ use crate::{CandidateFeatures, Network, Ranking, VerifierDescription};
 pub const FILE_BYTES_MAX: u64 = 64 * 1024 * 1024;
 
 /// Logits per unit of probability: the slope of the logit where success and failure are equally likely.
-const LOGITS_PER_PROBABILITY: f32 = 4.0;
+pub const LOGITS_PER_PROBABILITY: f32 = 4.0;
 
 /// A trained verifier for one policy.
 pub struct Verifier {
@@ -79,6 +79,11 @@ impl Verifier {
     /// What the file says about the training and its measured quality.
     pub fn description(&self) -> &VerifierDescription {
         &self.contents.description
+    }
+
+    /// How it tells the candidates of one decision apart; none in a verifier that is a network alone.
+    pub fn ranking(&self) -> Option<&Ranking> {
+        self.contents.ranking.as_ref()
     }
 
     /// The logit of every candidate of one decision, finite for every well-formed one.

@@ -69,7 +69,10 @@ pub fn read(
 }
 
 /// The candidate as the policy gave it; its hidden state is empty where it was not kept.
-fn candidate(record: &CandidateRecord, reader: CompletionReader<'_>) -> anyhow::Result<Candidate> {
+pub fn candidate(
+    record: &CandidateRecord,
+    reader: CompletionReader<'_>,
+) -> anyhow::Result<Candidate> {
     let CandidateRecord { tokens, log_probabilities, actions, malformed, hidden, .. } = record;
     let (parsed, confidence) = match actions {
         None => (Err(Malformed::new(malformed.clone().unwrap_or_default())), Vec::new()),

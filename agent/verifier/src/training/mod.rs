@@ -11,7 +11,7 @@
 //! The same episodes, options and seed give the same file.
 
 // What is trained on.
-mod decision_sample;
+pub(crate) mod decision_sample;
 mod eligibility;
 pub mod records;
 mod set;
