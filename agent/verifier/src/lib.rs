@@ -16,6 +16,9 @@ mod network;
 mod ranking;
 mod target;
 
+// Explanations of scores.
+mod explanation;
+
 // The file format.
 mod description;
 mod file;
@@ -27,8 +30,9 @@ pub mod training;
 pub use description::{
     RankingEvidence, ReRankingGain, TrainingData, TrainingOptions, VerifierDescription,
 };
+pub use explanation::{DecisionTerms, explain, term_names};
 pub use metrics::{Discrimination, Metrics, PHASE_STEPS, ScoredSamples, weighted_loss};
 pub use network::{Layer, Network, Standardisation};
 pub use ranking::{CandidateFeatures, FeatureLayout, Ranking};
 pub use target::{PredictedTarget, TERMS, TargetMap, TargetModel, terms};
-pub use verifier::{FILE_BYTES_MAX, Verifier, mean_hidden};
+pub use verifier::{FILE_BYTES_MAX, LOGITS_PER_PROBABILITY, Verifier, mean_hidden};

@@ -14,7 +14,7 @@ use crate::{CandidateFeatures, Network, Ranking, VerifierDescription};
 pub const FILE_BYTES_MAX: u64 = 64 * 1024 * 1024;
 
 /// The slope of the logit at a probability of 1/2: logits per unit of probability.
-const LOGITS_PER_PROBABILITY: f32 = 4.0;
+pub const LOGITS_PER_PROBABILITY: f32 = 4.0;
 
 /// A trained verifier for one policy.
 pub struct Verifier {
@@ -82,6 +82,11 @@ impl Verifier {
     /// The description of the training and the measured quality.
     pub fn description(&self) -> &VerifierDescription {
         &self.contents.description
+    }
+
+    /// How it tells the candidates of one decision apart; none in a verifier that is a network alone.
+    pub fn ranking(&self) -> Option<&Ranking> {
+        self.contents.ranking.as_ref()
     }
 
     /// The logit of every candidate of one decision; finite for every well-formed one.

@@ -1,5 +1,7 @@
 //! `rever report`: builds the page of a run, which opens from disk in any browser.
 
+mod terms;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -7,15 +9,16 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::files::policy_folder;
-use evaluation::report::{self, Report, ReportOptions, Speech};
+use evaluation::report::{self, Readers, Report, ReportOptions, Speech};
 use runtime::servers::Host;
 use store::run;
+use terms::ScoreTerms;
 use vla::CompletionParser;
 
 /// Episodes whose steps are written unless told otherwise: some 100 MB at the most.
 pub const EPISODES_MAX: usize = 1000;
 
-/// Builds the page of a run: tables, figures, and every episode with its candidates.
+/// Build the page of a run: figures, tables, and every episode with its candidates
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The run's folder
@@ -27,6 +30,10 @@ pub struct Arguments {
     /// [default: the one that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
+    /// The verifier that scored; the page shows the terms of its scores
+    /// [default: verifier.safetensors in the policy's folder]
+    #[arg(long, value_name = "FILE")]
+    verifier: Option<PathBuf>,
     /// Episodes whose steps are written; those with videos come first
     #[arg(long, default_value_t = EPISODES_MAX)]
     episodes_max: usize,
@@ -39,7 +46,9 @@ pub struct Arguments {
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let out = arguments.out.unwrap_or_else(|| arguments.run.join("report"));
     let policy = policy_folder(arguments.policy.as_ref(), host)?;
-    let report = build(&arguments.run, &out, &policy, arguments.episodes_max)?;
+    let options =
+        ReportOptions { run: &arguments.run, out: &out, episodes_max: arguments.episodes_max };
+    let report = build_with(&options, &policy, arguments.verifier.as_deref())?;
     if let Some(path) = &arguments.json {
         let text = serde_json::to_string_pretty(&report)?;
         std::fs::write(path, text + "\n")
@@ -49,20 +58,31 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     Ok(())
 }
 
-/// Builds the report of a run with the policy that made it.
+/// Builds the report of a run with the policy that made it, and the verifier in the policy's folder.
 pub fn build(run: &Path, out: &Path, policy: &Path, episodes_max: usize) -> Result<Report> {
-    let header = run::read_header(run)?;
-    let policy = CompletionParser::load(policy)?;
-    let (expected, found) = (header.versions["policy"].as_str(), policy.digest());
+    build_with(&ReportOptions { run, out, episodes_max }, policy, None)
+}
+
+fn build_with(
+    options: &ReportOptions<'_>,
+    policy: &Path,
+    verifier: Option<&Path>,
+) -> Result<Report> {
+    let header = run::read_header(options.run)?;
+    let parser = CompletionParser::load(policy)?;
+    let (expected, found) = (header.versions["policy"].as_str(), parser.digest());
     ensure!(
         expected == Some(found),
         "policy: the run was made with {}, got {found}; tokens mean nothing to another policy (--policy)",
         expected.unwrap_or("an unknown one")
     );
     let speak = |tokens: &[u32]| Speech {
-        text: policy.text(tokens),
-        reasoning: policy.parse(tokens).ok().map(|parsed| parsed.reasoning),
+        text: parser.text(tokens),
+        reasoning: parser.parse(tokens).ok().map(|parsed| parsed.reasoning),
     };
+    let terms = ScoreTerms::load(verifier, policy, &parser)?;
+    let explain = |record: &_| terms.of(record);
+    let readers = Readers { speak: &speak, terms: terms.names(), explain: &explain };
     let bar = ProgressBar::no_length().with_prefix("report");
     let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {eta}");
     bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
@@ -70,7 +90,7 @@ pub fn build(run: &Path, out: &Path, policy: &Path, episodes_max: usize) -> Resu
         bar.set_length(total as u64);
         bar.set_position(done as u64);
     };
-    let report = report::build(&ReportOptions { run, out, episodes_max }, &speak, &progress);
+    let report = report::build(options, &readers, &progress);
     bar.finish_and_clear();
     report
 }

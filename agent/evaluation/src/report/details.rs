@@ -8,15 +8,21 @@ use serde::Serialize;
 
 use store::record::{CandidateRecord, DecisionRecord, EpisodeRecord, StepRecord};
 
-use super::Speech;
+use super::{EpisodeTerms, Readers};
 
 /// What `data/{id}.js` hands to the page.
 #[derive(Serialize)]
 pub struct Details {
     id: String,
     phrases: Vec<String>,
+    /// Why there are no terms of the scores, where there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    no_terms: Option<String>,
     steps: Vec<Step>,
 }
+
+/// Terms of a score that are listed one by one; the others are summed.
+const TERMS_LISTED: usize = 5;
 
 #[derive(Serialize)]
 struct Step {
@@ -35,6 +41,9 @@ enum Candidate {
     Said {
         score: Option<f64>,
         log: f64,
+        /// The largest terms of its advantage in percentage points: which, and how much; then the sum of the others.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        terms: Option<(Vec<(usize, f64)>, f64)>,
         /// One list of numbers per action of the chunk.
         actions: Vec<Vec<f64>>,
         /// Task, plan, subtask reasoning, subtask, move reasoning, move.
@@ -68,25 +77,39 @@ impl Phrases {
 }
 
 impl Details {
-    /// Rebuilds what was said from the tokens of a record.
-    pub fn new(record: &EpisodeRecord, speak: &dyn Fn(&[u32]) -> Speech) -> anyhow::Result<Self> {
-        let mut phrases = Phrases::default();
-        let steps = record.steps.iter().map(|one| step(one, speak, &mut phrases));
-        let steps: Vec<Step> = steps
-            .collect::<anyhow::Result<_>>()
-            .with_context(|| format!("episode {}", record.identity.id()))?;
-        Ok(Self { id: record.identity.id(), phrases: phrases.list, steps })
+    /// Rebuilds what was said from the tokens of a record, and why it was scored as it was.
+    pub fn new(record: &EpisodeRecord, readers: &Readers<'_>) -> anyhow::Result<Self> {
+        let explain = || -> anyhow::Result<Self> {
+            let (terms, no_terms) = match (readers.explain)(record)? {
+                EpisodeTerms::Known(steps) => (steps, None),
+                EpisodeTerms::Unknown(reason) => (Vec::new(), Some(reason)),
+            };
+            let mut phrases = Phrases::default();
+            let steps = record.steps.iter().enumerate().map(|(index, one)| {
+                let terms = terms.get(index).and_then(Option::as_ref);
+                step(one, terms.map_or(&[][..], Vec::as_slice), readers, &mut phrases)
+            });
+            let steps: Vec<Step> = steps.collect::<anyhow::Result<_>>()?;
+            Ok(Self { id: record.identity.id(), phrases: phrases.list, no_terms, steps })
+        };
+        explain().with_context(|| format!("episode {}", record.identity.id()))
     }
 }
 
+/// `terms`: one row for each well-formed candidate, or none at all.
 fn step(
     step: &StepRecord,
-    speak: &dyn Fn(&[u32]) -> Speech,
+    terms: &[Vec<f32>],
+    readers: &Readers<'_>,
     phrases: &mut Phrases,
 ) -> anyhow::Result<Step> {
     let decision = step.decision.as_ref();
     let candidates = decision.map_or(&[][..], |decision| &decision.candidates);
-    let candidates = candidates.iter().map(|one| candidate(one, speak, phrases));
+    let mut rows = terms.iter();
+    let candidates = candidates.iter().map(|one| {
+        let row = one.actions.as_ref().and_then(|_| rows.next());
+        candidate(one, row.map(|row| largest(row)), readers, phrases)
+    });
     let statistics = &step.statistics;
     let flags = [
         statistics.is_grasped,
@@ -107,17 +130,28 @@ fn step(
     })
 }
 
+/// The largest terms first, in percentage points, and the sum of the others.
+fn largest(row: &[f32]) -> (Vec<(usize, f64)>, f64) {
+    let mut terms: Vec<(usize, f32)> = row.iter().copied().enumerate().collect();
+    terms.sort_by(|a, b| b.1.abs().total_cmp(&a.1.abs()));
+    let others: f32 = terms.iter().skip(TERMS_LISTED).map(|(_, value)| value).sum();
+    let listed = terms.into_iter().take(TERMS_LISTED).filter(|(_, value)| *value != 0.0);
+    let listed = listed.map(|(index, value)| (index, rounded(100.0 * value, 3))).collect();
+    (listed, rounded(100.0 * others, 3))
+}
+
 fn candidate(
     record: &CandidateRecord,
-    speak: &dyn Fn(&[u32]) -> Speech,
+    terms: Option<(Vec<(usize, f64)>, f64)>,
+    readers: &Readers<'_>,
     phrases: &mut Phrases,
 ) -> anyhow::Result<Candidate> {
     // A policy that tells no tokens has no text and no reasoning.
     let speech = match record.tokens.is_empty() {
-        true => Speech { text: String::new(), reasoning: Some(Reasoning::default()) },
-        false => speak(&record.tokens),
+        true => super::Speech { text: String::new(), reasoning: Some(Reasoning::default()) },
+        false => (readers.speak)(&record.tokens),
     };
-    let score = record.score.map(|score| rounded(score, 6));
+    let score = record.score.map(|score| rounded(score, 8));
     let log = rounded(record.log_probability, 2);
     let Some(actions) = &record.actions else {
         let reason = record.malformed.clone().context("a malformed candidate has a reason")?;
@@ -148,6 +182,7 @@ fn candidate(
     Ok(Candidate::Said {
         score,
         log,
+        terms,
         actions: actions.actions().iter().map(numbers).collect(),
         says: says.map(|phrase| phrases.number(phrase)),
         boxes,

@@ -1,23 +1,20 @@
 //! The forest plot: paired gains in percentage points with their intervals, one line per comparison.
 
-use std::fmt::Write;
+use super::figure::{Figure, csv_line};
+use super::intervals::{self, Frame, IntervalRow};
 
-use super::axis::Axis;
-use super::escape;
-
-/// One comparison; gains are fractions of episodes, positive when the first strategy is better.
+/// One comparison; gains are fractions of episodes, positive when the first setting is better.
 pub struct Comparison {
-    pub label: String,
-    pub episodes: usize,
+    pub better: String,
+    pub worse: String,
+    /// Of the setting that is in question.
+    pub strategy: String,
+    pub pairs: usize,
     pub gain: f64,
     pub low: f64,
     pub high: f64,
 }
 
-const WIDTH: f64 = 860.0;
-const LABELS: f64 = 300.0;
-const VALUES: f64 = 215.0;
-const ROW: f64 = 26.0;
 /// Percentage points that the axis shows at least on either side of zero.
 const SPAN_MIN: f64 = 5.0;
 
@@ -26,73 +23,70 @@ pub fn figure(comparisons: &[Comparison]) -> String {
     if comparisons.is_empty() {
         return String::new();
     }
-    let points: Vec<(f64, f64, f64)> = comparisons
-        .iter()
-        .map(|one| (one.gain * 100.0, one.low * 100.0, one.high * 100.0))
-        .collect();
-    let low = points.iter().map(|point| point.1).fold(-SPAN_MIN, f64::min);
-    let high = points.iter().map(|point| point.2).fold(SPAN_MIN, f64::max);
+    let rows: Vec<IntervalRow> = comparisons.iter().map(row).collect();
+    let low = rows.iter().map(|row| row.low).fold(-SPAN_MIN, f64::min);
+    let high = rows.iter().map(|row| row.high).fold(SPAN_MIN, f64::max);
     let margin = ((high - low) * 0.05).max(1.0);
-    let axis = Axis { low: low - margin, high: high + margin, from: LABELS, to: WIDTH - VALUES };
-    let height = ROW * comparisons.len() as f64 + 34.0;
-    let mut svg = format!(
-        "<svg class=\"figure forest\" viewBox=\"0 0 {WIDTH} {height}\" role=\"img\" \
-         aria-label=\"paired gains with 95 % intervals\">"
-    );
-    let bottom = height - 24.0;
-    for tick in axis.ticks(6) {
-        let place = axis.at(tick);
-        let class = if tick == 0.0 { "zero" } else { "grid" };
-        let _ = write!(
-            svg,
-            "<line class=\"{class}\" x1=\"{place:.1}\" x2=\"{place:.1}\" y1=\"2\" y2=\"{bottom:.1}\"/>\
-             <text class=\"tick\" x=\"{place:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>",
-            bottom + 16.0,
-            if tick == 0.0 { "0".to_owned() } else { format!("{tick:+.0}") }
-        );
+    let frame = Frame {
+        low: low - margin,
+        high: high + margin,
+        title: "paired gain in success (percentage points)",
+        sides: Some(["worse", "better"]),
+    };
+    let header = ["setting", "compared with", "gain", "low", "high", "pairs"].map(str::to_owned);
+    let mut csv = csv_line(&header);
+    for one in comparisons {
+        let numbers = [one.gain, one.low, one.high].map(|value| format!("{:.3}", 100.0 * value));
+        let [gain, low, high] = numbers;
+        let cells = [one.better.clone(), one.worse.clone(), gain, low, high, one.pairs.to_string()];
+        csv.push_str(&csv_line(&cells));
     }
-    for (index, (one, (gain, low, high))) in comparisons.iter().zip(points).enumerate() {
-        let middle = ROW * (index as f64 + 0.5) + 4.0;
-        let class = match (low > 0.0, high < 0.0) {
-            (true, _) => "better",
-            (_, true) => "worse",
-            _ => "open",
-        };
-        let _ = write!(
-            svg,
-            "<g class=\"{class}\"><text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>\
-             <line class=\"whisker\" x1=\"{:.1}\" x2=\"{:.1}\" y1=\"{middle:.1}\" y2=\"{middle:.1}\"/>\
-             <circle cx=\"{:.1}\" cy=\"{middle:.1}\" r=\"5\"/>\
-             <text class=\"value\" x=\"{:.1}\" y=\"{:.1}\">{gain:+.1} [{low:+.1}, {high:+.1}] \
-             <tspan class=\"muted\">{} pairs</tspan></text></g>",
-            LABELS - 14.0,
-            middle + 4.0,
-            escape::html(&one.label),
-            axis.at(low),
-            axis.at(high),
-            axis.at(gain),
-            WIDTH - VALUES + 12.0,
-            middle + 4.0,
-            one.episodes,
-        );
+    let described: Vec<String> =
+        rows.iter().map(|row| format!("{}: {} {}", row.label, row.text, row.count)).collect();
+    let figure = Figure {
+        name: "paired-gains".to_owned(),
+        description: format!(
+            "Paired gains in percentage points with 95 % intervals. {}",
+            described.join("; ")
+        ),
+        csv,
+    };
+    figure.html(|room| intervals::draw(&rows, &frame, room))
+}
+
+fn row(one: &Comparison) -> IntervalRow {
+    let [value, low, high] = [one.gain, one.low, one.high].map(|value| 100.0 * value);
+    IntervalRow {
+        label: format!("{} − {}", one.better, one.worse),
+        strategy: one.strategy.clone(),
+        value,
+        low,
+        high,
+        text: format!("{value:+.1} [{low:+.1}, {high:+.1}]").replace('-', "−"),
+        count: format!("{} pairs", one.pairs),
     }
-    svg.push_str("</svg>");
-    svg
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn one(label: &str, gain: f64, low: f64, high: f64) -> Comparison {
-        Comparison { label: label.to_owned(), episodes: 40, gain, low, high }
-    }
-
     #[test]
-    fn an_interval_above_zero_is_marked_better_and_labels_are_escaped() {
-        let svg = figure(&[one("a<b", 0.119, 0.06, 0.18), one("even", 0.0, -0.1, 0.1)]);
-        assert!(svg.contains("class=\"better\"") && svg.contains("class=\"open\""), "{svg}");
-        assert!(svg.contains("a&lt;b") && svg.contains("+11.9 [+6.0, +18.0]"), "{svg}");
+    fn a_comparison_names_both_settings_and_which_side_is_better() {
+        let one = Comparison {
+            better: "verifier N=5 T=1".into(),
+            worse: "a<b".into(),
+            strategy: "verifier".into(),
+            pairs: 40,
+            gain: 0.119,
+            low: -0.06,
+            high: 0.18,
+        };
+        let text = figure(&[one]);
+        assert!(text.contains("verifier N=5 T=1 − a&lt;b"), "{text}");
+        assert!(text.contains("+11.9 [−6.0, +18.0]") && text.contains("40 pairs"), "{text}");
+        assert!(text.contains("better ▸") && text.contains("◂ worse"), "{text}");
+        assert!(text.contains("verifier N=5 T=1,a&lt;b,11.900,-6.000,18.000,40"), "{text}");
         assert_eq!(figure(&[]), "");
     }
 }

@@ -1,26 +1,28 @@
-//! The head of the page: what the run shows, its main figures, options and versions.
+//! The head of the page: what the run shows, its main figures, and the command that made it.
 
-use std::collections::BTreeSet;
-
-use serde_json::Value;
-use store::run::{RunHeader, RunStart};
+use store::run::RunHeader;
 
 use super::escape::html;
+use super::glossary::term_as;
+use super::provenance::{command_line, date};
 use crate::headline::Headline;
 use crate::results::{Counts, Results, StepTime};
 
-/// A digest is known by its beginning.
-const VERSION_LETTERS: usize = 16;
-
-/// Name, headline, facts, and all options, versions and command lines to unfold.
-pub fn head(header: &RunHeader, simulators: &BTreeSet<String>, results: &Results) -> String {
+/// Name and date, headline, facts, command line.
+pub fn head(header: &RunHeader, results: &Results) -> String {
+    let made = header.starts.last().map_or_else(String::new, |start| {
+        format!(
+            "<span>{}</span><span>commit <code>{}</code></span><span class=\"command\"><code class=\"copy\">{}</code></span>",
+            html(&date(&start.time)),
+            html(&start.build.commit_text()),
+            html(&command_line(&start.command))
+        )
+    });
     format!(
-        "<h1>{}</h1><p class=\"headline\">{}</p><dl class=\"facts\">{}</dl>\
-         <details><summary>options, versions and command lines</summary><dl class=\"facts\">{}</dl></details>",
+        "<div class=\"run\"><h1>{}</h1>{made}</div><p class=\"headline\">{}</p><dl class=\"facts\">{}</dl>",
         html(&header.run),
         headline(results),
-        main_facts(header, simulators, results),
-        all_facts(header),
+        facts(results),
     )
 }
 
@@ -29,65 +31,43 @@ fn headline(results: &Results) -> String {
         return String::new();
     };
     let gain = gain.map_or_else(String::new, |gain| {
-        let class = if gain.starts_with('-') { " class=\"worse\"" } else { "" };
+        let class = if gain.starts_with(['-', '−']) { " class=\"worse\"" } else { "" };
         format!(" <b{class}>{}</b>", html(&gain))
     });
-    format!("{}{gain} {}", html(&statement), html(&remark))
+    format!("{}{gain} <span class=\"remark\">{}</span>", html(&statement), html(&remark))
 }
 
-fn main_facts(header: &RunHeader, simulators: &BTreeSet<String>, results: &Results) -> String {
-    let total = |of: fn(&Counts) -> u64| {
-        results.settings.iter().map(|setting| of(&setting.all.counts)).sum::<u64>().to_string()
+fn facts(results: &Results) -> String {
+    let total = |of: fn(&Counts) -> u64| -> u64 {
+        results.settings.iter().map(|setting| of(&setting.all.counts)).sum()
     };
     let mut facts = vec![
-        ("episodes", results.counted.len().to_string()),
-        ("faults", total(|counts| counts.faults)),
-        ("policy never acted", total(|counts| counts.never_acted)),
-        ("malformed candidates", total(|counts| counts.malformed)),
-        ("held steps", total(|counts| counts.held_steps)),
+        fact("episodes", results.counted.len().to_string()),
+        fact(&term_as("fault", "faults"), total(|counts| counts.faults).to_string()),
     ];
+    for (name, count) in [
+        (term_as("malformed", "malformed candidates"), total(|counts| counts.malformed)),
+        ("steps held still".to_owned(), total(|counts| counts.held_steps)),
+        ("policy never acted".to_owned(), total(|counts| counts.never_acted)),
+    ] {
+        if count > 0 {
+            facts.push(fact(&name, count.to_string()));
+        }
+    }
     let batch =
         results.batch_size.map_or_else(String::new, |size| format!(" in batches of {size:.0}"));
-    let times = [
-        ("a decision takes", results.decision_ms, batch),
-        ("a step takes", results.step_ms, String::new()),
-        ("its simulator takes", results.simulator_ms, String::new()),
-    ];
-    for (what, time, how) in times {
+    for (name, time, how) in [
+        ("time per decision", results.decision_ms, batch),
+        ("time per step", results.step_ms, String::new()),
+    ] {
         if let Some(StepTime { p50, p95 }) = time {
-            facts.push((what, format!("{p50:.1} ms{how} (p95 {p95:.1} ms)")));
+            facts.push(fact(name, format!("{p50:.1} ms{how} (95th percentile {p95:.1})")));
         }
     }
-    let simulators: Vec<&str> = simulators.iter().map(String::as_str).collect();
-    facts.push(("simulator", simulators.join(", ")));
-    for name in ["policy", "verifier"] {
-        if let Some(version) = header.versions.get(name).and_then(Value::as_str) {
-            facts.push((name, version.chars().take(VERSION_LETTERS).collect()));
-        }
-    }
-    facts.iter().map(|(name, value)| fact(name, value)).collect()
+    facts.concat()
 }
 
-/// Options and versions one by one, then the command lines and builds that made the run.
-fn all_facts(header: &RunHeader) -> String {
-    let objects = [&header.options, &header.versions].map(Value::as_object).into_iter().flatten();
-    let named = objects.flatten().map(|(name, value)| fact_of(name, value));
-    let starts = header.starts.iter().map(|RunStart { time, command, build }| {
-        fact(&format!("started {time}"), &format!("{} with {build}", command.join(" ")))
-    });
-    named.chain(starts).collect()
-}
-
-/// Nothing for an option that is not set.
-fn fact_of(name: &str, value: &Value) -> String {
-    let plain = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-    match value {
-        Value::Null => String::new(),
-        Value::Array(list) => fact(name, &list.iter().map(plain).collect::<Vec<_>>().join(", ")),
-        value => fact(name, &plain(value)),
-    }
-}
-
-fn fact(name: &str, value: &str) -> String {
-    format!("<div><dt>{}</dt><dd>{}</dd></div>", html(name), html(value))
+/// `name` is HTML already.
+fn fact(name: &str, value: String) -> String {
+    format!("<div><dt>{name}</dt><dd>{}</dd></div>", html(&value))
 }

@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! index.html              tables and figures, readable without scripts
-//! style.css, *.js         the episode browser
-//! data/catalogue.js       one line per episode
+//! *.css, *.js             the viewer of episodes, and what figures and tables can be asked for
+//! data/catalogue.js       one entry per episode, paired by initial layout
 //! data/{id}.js            the steps of one episode, loaded when it is looked at
 //! videos/{id}.mp4         the videos that the run has
 //! ```
@@ -12,18 +12,24 @@
 //! that hand over one value each.
 
 mod axis;
-mod bars;
 mod catalogue;
 mod curve;
 mod details;
 mod escape;
+mod figure;
 mod forest;
+mod glossary;
 mod head;
+mod intervals;
+mod milestones;
 mod page;
+mod provenance;
 #[cfg(test)]
 pub(crate) mod sample;
 mod scores;
 mod sections;
+mod strategies;
+mod tables;
 #[cfg(test)]
 mod tests;
 
@@ -40,6 +46,7 @@ use store::run;
 
 use catalogue::Catalogue;
 use details::Details;
+use milestones::Milestones;
 use scores::Scored;
 
 /// What a report is made of and where it goes.
@@ -60,6 +67,25 @@ pub struct Speech {
     pub reasoning: Option<Reasoning>,
 }
 
+/// What the scores of an episode are made of.
+pub enum EpisodeTerms {
+    /// One entry per step, none without a decision; in it one row for each well-formed candidate. A row has one number for
+    /// each term: what it adds to the candidate's advantage over its siblings, as a probability.
+    Known(Vec<Option<Vec<Vec<f32>>>>),
+    /// Why there are none, as a sentence.
+    Unknown(String),
+}
+
+/// What turns records into something that people can read.
+pub struct Readers<'a> {
+    /// The text of tokens.
+    pub speak: &'a dyn Fn(&[u32]) -> Speech,
+    /// What each term is.
+    pub terms: Vec<String>,
+    /// The terms of an episode's scores.
+    pub explain: &'a dyn Fn(&EpisodeRecord) -> anyhow::Result<EpisodeTerms>,
+}
+
 /// What was written.
 #[derive(Debug, Serialize)]
 pub struct Report {
@@ -78,7 +104,7 @@ pub struct Report {
 /// Builds the report; `progress` hears how many episodes are done, of how many.
 pub fn build(
     options: &ReportOptions<'_>,
-    speak: &dyn Fn(&[u32]) -> Speech,
+    readers: &Readers<'_>,
     progress: &dyn Fn(usize, usize),
 ) -> anyhow::Result<Report> {
     let header = run::read_header(options.run)?;
@@ -86,26 +112,37 @@ pub fn build(
     let name = options.run.display();
     ensure!(!summaries.is_empty(), "the run {name} has no finished episode to report");
     let has_video = |id: &str| run::video_path(options.run, id).is_file();
-    let results =
-        Results::new(&summaries, &run::faults(options.run)?, &tasks_in_order(&header.options))?;
-    let catalogue = Catalogue::new(&summaries, &results.tasks, has_video, options.episodes_max);
+    let faults = run::faults(options.run)?;
+    let results = Results::new(&summaries, &faults, &tasks_in_order(&header.options))?;
+    let mut catalogue = Catalogue::new(
+        &header.run,
+        &summaries,
+        &faults,
+        &results,
+        has_video,
+        options.episodes_max,
+    )?;
+    catalogue.terms.clone_from(&readers.terms);
     let mut folder = Folder::new(options.out)?;
-    let detailed = catalogue.detailed();
     let mut scored = Vec::new();
     let mut simulators = BTreeSet::new();
-    for (done, entry) in catalogue.episodes.iter().enumerate() {
-        progress(done, catalogue.episodes.len());
+    let (total, mut detailed, mut videos) = (summaries.len(), 0, 0);
+    for (done, entry) in catalogue.recorded_mut().enumerate() {
+        progress(done, total);
         let record = EpisodeRecord::read(&run::record_path(options.run, &entry.id))?;
+        entry.milestones = Milestones::of(&record);
         if results.counted.contains(&entry.id) {
             scored.extend(chosen_scores(&record)?);
         }
         simulators.insert(record.versions.simulator.clone());
-        if detailed.contains(entry.id.as_str()) {
-            let details = Details::new(&record, speak)?;
+        if entry.detail {
+            let details = Details::new(&record, readers)?;
             folder.write_script(&entry.id, "reverEpisode(", &details, ");\n")?;
+            detailed += 1;
         }
         if entry.video {
             folder.take_video(&run::video_path(options.run, &entry.id), &entry.id)?;
+            videos += 1;
         }
     }
     folder.write_script("catalogue", "window.reverCatalogue = ", &catalogue, ";\n")?;
@@ -117,12 +154,12 @@ pub fn build(
         sections::page(&header, &simulators, &results, &scored).html()?.as_bytes(),
     )?;
     folder.sweep()?;
-    progress(catalogue.episodes.len(), catalogue.episodes.len());
+    progress(total, total);
     Ok(Report {
         page: options.out.join("index.html"),
-        episodes: catalogue.episodes.len(),
-        detailed: detailed.len(),
-        videos: catalogue.episodes.iter().filter(|entry| entry.video).count(),
+        episodes: total,
+        detailed,
+        videos,
         bytes: folder.bytes,
     })
 }
@@ -148,8 +185,9 @@ impl<'a> Folder<'a> {
     fn new(path: &'a Path) -> anyhow::Result<Self> {
         for folder in ["data", "videos"] {
             let folder = path.join(folder);
-            std::fs::create_dir_all(&folder)
-                .with_context(|| format!("cannot make {}", folder.display()))?;
+            std::fs::create_dir_all(&folder).with_context(|| {
+                format!("cannot make {}; choose another folder (--out)", folder.display())
+            })?;
         }
         Ok(Self { path, written: BTreeSet::new(), bytes: 0 })
     }

@@ -5,11 +5,17 @@ use anyhow::ensure;
 const TEMPLATE: &str = include_str!("page/page.html");
 
 /// Files that every report has, by name.
-pub const FILES: [(&str, &str); 4] = [
+pub const FILES: [(&str, &str); 10] = [
     ("style.css", include_str!("page/style.css")),
-    ("candidates.js", include_str!("page/candidates.js")),
+    ("viewer.css", include_str!("page/viewer.css")),
+    ("elements.js", include_str!("page/elements.js")),
     ("stage.js", include_str!("page/stage.js")),
-    ("browser.js", include_str!("page/browser.js")),
+    ("strip.js", include_str!("page/strip.js")),
+    ("candidates.js", include_str!("page/candidates.js")),
+    ("player.js", include_str!("page/player.js")),
+    ("list.js", include_str!("page/list.js")),
+    ("figures.js", include_str!("page/figures.js")),
+    ("viewer.js", include_str!("page/viewer.js")),
 ];
 
 /// What changes from run to run; all of it is HTML already.

@@ -7,13 +7,14 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::json;
 
-use super::Speech;
+use super::{EpisodeTerms, Readers, Speech};
 use decision::{ActionChunk, Reasoning, VisibleObject};
+use store::queue::FaultScope;
 use store::record::{
     CandidateRecord, DecisionRecord, EpisodeIdentity, EpisodeRecord, RECORD_VERSION, StepRecord,
     Versions,
 };
-use store::run::{EpisodeSummary, Run, RunRequest, write_video};
+use store::run::{EpisodeSummary, FaultRecord, Run, RunRequest, write_video};
 use store::video::Video;
 
 pub const TASKS: [&str; 2] = ["widowx_spoon_on_towel", "widowx_stack_cube"];
@@ -40,6 +41,38 @@ pub fn speak(tokens: &[u32]) -> Speech {
         gripper_position: vec![[128, first]],
     };
     Speech { text, reasoning: (first % 17 != 0).then_some(reasoning) }
+}
+
+/// Reads the made-up run; every candidate's advantage is the sum of three terms.
+pub fn readers() -> Readers<'static> {
+    let names = ["agreement", "confidence", "<i>target</i>"].map(str::to_owned);
+    Readers { speak: &speak, terms: names.to_vec(), explain: &|record| Ok(explain(record)) }
+}
+
+fn explain(record: &EpisodeRecord) -> EpisodeTerms {
+    if record.identity.candidates == 1 {
+        return EpisodeTerms::Unknown("one candidate has no siblings".to_owned());
+    }
+    let row = |index: usize| vec![0.01 * index as f32, -0.002, 0.0];
+    let terms = |decision: &DecisionRecord| {
+        let count = decision.candidates.iter().filter(|one| one.actions.is_some()).count();
+        (0..count).map(row).collect()
+    };
+    let steps = record.steps.iter().map(|step| step.decision.as_ref().map(terms));
+    EpisodeTerms::Known(steps.collect())
+}
+
+/// Attempts of one episode that never ended.
+pub fn faults() -> Vec<FaultRecord> {
+    let identity = identity(TASKS[1], EPISODES, "verifier", 5);
+    let fault = |attempt| FaultRecord {
+        identity: identity.clone(),
+        attempt,
+        server: "server".to_owned(),
+        scope: FaultScope::Server,
+        reason: "the server went away".to_owned(),
+    };
+    vec![fault(1), fault(2)]
 }
 
 /// All records of the made-up run.
@@ -75,6 +108,9 @@ pub fn write(folder: &Path) -> anyhow::Result<()> {
             write_video(&run.folder, &record.identity.id(), &video(record)?)?;
         }
         run.record(record)?;
+    }
+    for fault in faults() {
+        run.fault(&fault)?;
     }
     run.complete()
 }

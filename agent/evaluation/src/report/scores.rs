@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use super::axis::Axis;
+use super::figure::{Drawing, Figure, Room, csv_line};
 
 /// Scores that fell into one interval; both values are fractions.
 pub struct Bin {
@@ -20,26 +21,54 @@ pub struct Scored {
     pub is_selected: bool,
 }
 
-const WIDTH: f64 = 420.0;
-const HEIGHT: f64 = 320.0;
+const HEIGHT: f64 = 330.0;
+const LEFT: f64 = 52.0;
 const HISTOGRAM_BINS: usize = 20;
+
+fn width(room: Room) -> f64 {
+    if room == Room::Wide { 460.0 } else { 350.0 }
+}
+
+fn axes(room: Room) -> (Axis, Axis) {
+    let across = Axis { low: 0.0, high: 1.0, from: LEFT, to: width(room) - 14.0 };
+    (across, Axis { low: 0.0, high: 1.0, from: HEIGHT - 48.0, to: 30.0 })
+}
 
 /// Predicted score against the share of steps whose episode succeeded; the diagonal is perfect.
 pub fn reliability(bins: &[Bin]) -> String {
-    let most = bins.iter().map(|bin| bin.count).max().unwrap_or(0);
-    if most == 0 {
-        return String::new();
+    let filled: Vec<&Bin> = bins.iter().filter(|bin| bin.count > 0).collect();
+    let Some(most) = filled.iter().map(|bin| bin.count).max() else { return String::new() };
+    let mut csv = csv_line(&["score_mean", "success_rate", "steps"].map(str::to_owned));
+    for bin in &filled {
+        let rates = [bin.score_mean, bin.success_rate].map(|value| format!("{value:.4}"));
+        let [score, success] = rates;
+        csv.push_str(&csv_line(&[score, success, bin.count.to_string()]));
     }
-    let across = Axis { low: 0.0, high: 1.0, from: 46.0, to: WIDTH - 14.0 };
-    let up = Axis { low: 0.0, high: 1.0, from: HEIGHT - 44.0, to: 12.0 };
-    let mut svg = open("verifier score against success rate");
-    frame(&mut svg, &across, "mean score of the chosen candidate");
+    let figure = Figure {
+        name: "reliability".to_owned(),
+        description: "Share of steps whose episode succeeded, against the mean score of the executed candidates; \
+                      on the diagonal scores are calibrated"
+            .to_owned(),
+        csv,
+    };
+    figure.html(|room| draw_reliability(&filled, most, room))
+}
+
+fn draw_reliability(bins: &[&Bin], most: usize, room: Room) -> Drawing {
+    let (across, up) = axes(room);
+    let mut svg = String::new();
+    frame(
+        &mut svg,
+        &across,
+        "mean score of the executed candidates",
+        "steps of successful episodes (%)",
+    );
     for tick in up.ticks(5) {
         let place = up.at(tick);
         let _ = write!(
             svg,
             "<line class=\"grid\" x1=\"{:.1}\" x2=\"{:.1}\" y1=\"{place:.1}\" y2=\"{place:.1}\"/>\
-             <text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{:.0} %</text>",
+             <text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{:.0}</text>",
             across.from,
             across.to,
             across.from - 8.0,
@@ -49,20 +78,29 @@ pub fn reliability(bins: &[Bin]) -> String {
     }
     let _ = write!(
         svg,
-        "<line class=\"zero dashed\" x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\"/>",
-        across.from, up.from, across.to, up.to
+        "<line class=\"zero dashed\" x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\"/>\
+         <text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">calibrated</text>",
+        across.from,
+        up.from,
+        across.to,
+        up.to,
+        across.at(0.78),
+        up.at(0.86)
     );
-    let filled = || bins.iter().filter(|bin| bin.count > 0);
     let place =
-        |bin: &Bin| format!("{:.1},{:.1}", across.at(bin.score_mean), up.at(bin.success_rate));
-    let points: Vec<String> = filled().map(place).collect();
-    let _ = write!(svg, "<g class=\"series series-0\"><polyline points=\"{}\"/>", points.join(" "));
-    for bin in filled() {
+        |bin: &&Bin| format!("{:.1},{:.1}", across.at(bin.score_mean), up.at(bin.success_rate));
+    let points: Vec<String> = bins.iter().map(place).collect();
+    let _ = write!(
+        svg,
+        "<g class=\"series\" data-strategy=\"verifier\"><polyline points=\"{}\"/>",
+        points.join(" ")
+    );
+    for bin in bins {
         // The area of a dot is proportional to the number of steps behind it.
         let radius = 2.5 + 7.5 * (bin.count as f64 / most as f64).sqrt();
         let _ = write!(
             svg,
-            "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"{radius:.1}\"><title>score {:.2}: {:.1} % success, \
+            "<circle class=\"value\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"{radius:.1}\"><title>score {:.2}: {:.1} % success, \
              {} steps</title></circle>",
             across.at(bin.score_mean),
             up.at(bin.success_rate),
@@ -71,8 +109,8 @@ pub fn reliability(bins: &[Bin]) -> String {
             bin.count
         );
     }
-    svg.push_str("</g></svg>");
-    svg
+    svg.push_str("</g>");
+    Drawing { content: svg, width: width(room), height: HEIGHT }
 }
 
 /// Two histograms of scores, successes above the line and failures below, each as a share of its own.
@@ -82,16 +120,43 @@ pub fn by_outcome(scores: &[Scored]) -> String {
     let (Some(successes), Some(failures)) = (successes, failures) else {
         return String::new();
     };
-    let top = successes.iter().chain(&failures).copied().fold(0.0, f64::max);
-    let across = Axis { low: 0.0, high: 1.0, from: 46.0, to: WIDTH - 14.0 };
-    let middle = (HEIGHT - 32.0) / 2.0;
-    let reach = middle - 10.0;
-    let mut svg = open("verifier scores of successes and failures");
-    frame(&mut svg, &across, "score of the chosen candidate");
+    let header = ["score_from", "score_to", "share_of_success_steps", "share_of_failure_steps"];
+    let mut csv = csv_line(&header.map(str::to_owned));
+    for (index, (success, failure)) in successes.iter().zip(&failures).enumerate() {
+        let edge = |index: usize| index as f64 / HISTOGRAM_BINS as f64;
+        let cells = [edge(index), edge(index + 1), *success, *failure];
+        csv.push_str(&csv_line(&cells.map(|value| format!("{value:.4}"))));
+    }
+    let figure = Figure {
+        name: "scores-by-outcome".to_owned(),
+        description: "Histograms of the scores of executed candidates: in successful episodes above the line, in \
+                      failed ones below it"
+            .to_owned(),
+        csv,
+    };
+    figure.html(|room| draw_by_outcome([&successes, &failures], room))
+}
+
+fn draw_by_outcome([successes, failures]: [&[f64]; 2], room: Room) -> Drawing {
+    let top = successes.iter().chain(failures).copied().fold(0.0, f64::max);
+    let (across, up) = axes(room);
+    let middle = f64::midpoint(up.from, up.to);
+    let half = (up.from - up.to) / 2.0 - 4.0;
     let wide = (across.to - across.from) / HISTOGRAM_BINS as f64;
-    for (name, values) in [("success", &successes), ("failure", &failures)] {
-        for (index, value) in values.iter().enumerate() {
-            let tall = value / top * reach;
+    let mut svg = String::new();
+    frame(&mut svg, &across, "score of the executed candidate", "share of steps (%)");
+    for share in [-top, 0.0, top] {
+        let _ = write!(
+            svg,
+            "<text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{:.0}</text>",
+            across.from - 8.0,
+            middle - share / top * half + 4.0,
+            share.abs() * 100.0
+        );
+    }
+    for (name, values) in [("success", successes), ("failure", failures)] {
+        for (index, value) in values.iter().enumerate().filter(|(_, value)| **value > 0.0) {
+            let tall = value / top * half;
             let y = if name == "success" { middle - tall } else { middle };
             let _ = write!(
                 svg,
@@ -106,15 +171,16 @@ pub fn by_outcome(scores: &[Scored]) -> String {
     let _ = write!(
         svg,
         "<line class=\"zero\" x1=\"{:.1}\" x2=\"{:.1}\" y1=\"{middle:.1}\" y2=\"{middle:.1}\"/>\
-         <text class=\"success\" x=\"{:.1}\" y=\"24\">success</text>\
-         <text class=\"failure\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">failure</text></svg>",
+         <text class=\"success\" x=\"{:.1}\" y=\"{:.1}\">successful episodes</text>\
+         <text class=\"failure\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">failed episodes</text>",
         across.from,
         across.to,
         across.from + 4.0,
+        up.to + 12.0,
         across.to - 4.0,
-        HEIGHT - 52.0
+        up.from - 6.0
     );
-    svg
+    Drawing { content: svg, width: width(room), height: HEIGHT }
 }
 
 fn shares(scores: &[Scored], is_success: bool) -> Option<Vec<f64>> {
@@ -127,26 +193,21 @@ fn shares(scores: &[Scored], is_success: bool) -> Option<Vec<f64>> {
     (total > 0).then(|| counts.into_iter().map(|count| count as f64 / total as f64).collect())
 }
 
-fn open(label: &str) -> String {
-    format!(
-        "<svg class=\"figure scores\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" \
-         aria-label=\"{label}\">"
-    )
-}
-
-fn frame(svg: &mut String, across: &Axis, caption: &str) {
+/// The axis below with its title, and the title of the one on the left.
+fn frame(svg: &mut String, across: &Axis, below: &str, left: &str) {
     for tick in across.ticks(5) {
         let _ = write!(
             svg,
             "<text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{tick:.1}</text>",
             across.at(tick),
-            HEIGHT - 26.0
+            HEIGHT - 28.0
         );
     }
     let _ = write!(
         svg,
-        "<text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{caption}</text>",
-        across.to,
+        "<text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{below}</text>\
+         <text class=\"tick\" x=\"2\" y=\"14\">{left}</text>",
+        f64::midpoint(across.from, across.to),
         HEIGHT - 8.0
     );
 }
@@ -158,7 +219,7 @@ mod tests {
     #[test]
     fn empty_bins_are_left_out() {
         let bin = |count| Bin { score_mean: 0.25, success_rate: 0.5, count };
-        assert_eq!(reliability(&[bin(3), bin(0)]).matches("<circle").count(), 1);
+        assert_eq!(reliability(&[bin(3), bin(0)]).matches("<circle").count(), 2, "in two widths");
         assert_eq!(reliability(&[bin(0)]), "");
     }
 
@@ -167,7 +228,7 @@ mod tests {
         let success = Scored { score: 1.0, is_success: true, is_selected: false };
         let failure = Scored { score: 0.1, is_success: false, is_selected: false };
         assert_eq!(by_outcome(&[success, success]), "");
-        let svg = by_outcome(&[success, failure]);
-        assert_eq!(svg.matches("100.0 % of the steps of").count(), 2);
+        let text = by_outcome(&[success, failure]);
+        assert_eq!(text.matches("100.0 % of the steps of").count(), 2 * 2, "in two widths");
     }
 }

@@ -1,22 +1,23 @@
-//! The sections of the page: what the numbers of a run look like in words, tables and figures.
+//! The sections of the page: the numbers of a run in tables and figures, with what to see in them.
 
 use std::collections::BTreeSet;
 
 use decision::{Strategy, TaskId};
 use store::run::RunHeader;
 
-use super::bars::Bar;
 use super::catalogue::task_words;
 use super::curve::{Point, Series};
 use super::escape::html;
+use super::figure::{Figure, csv_line};
 use super::forest::Comparison;
+use super::glossary::{self, term, term_as};
+use super::intervals::{Frame, IntervalRow};
 use super::page::Page;
 use super::scores::{Bin, Scored};
-use super::{bars, curve, forest, head, scores};
+use super::{curve, forest, head, intervals, provenance, scores, tables};
 use crate::calibration;
 use crate::comparisons::{SettingGain, SettingHeadroom};
-use crate::estimate::Rate;
-use crate::results::{Counts, Results, SettingResult};
+use crate::results::{Results, SettingResult};
 use crate::statistics::auroc;
 
 /// The whole page of a run.
@@ -30,8 +31,10 @@ pub fn page(
         ("result", "Result", result(results)),
         ("gains", "Paired gains", gains(results)),
         ("candidates", "Success against the number of candidates", candidates(results)),
-        ("verifier", "What the verifier’s scores mean", verifier(scored)),
         ("tasks", "Success per task", tasks(results)),
+        ("verifier", "What the verifier’s scores mean", verifier(scored)),
+        ("run", "How this run was made", provenance::section(header, simulators)),
+        ("terms", "Terms", glossary::list()),
     ];
     let build =
         header.starts.last().map_or_else(|| "rever".to_owned(), |start| start.build.to_string());
@@ -39,103 +42,37 @@ pub fn page(
     let links = shown().map(|(id, _, _)| format!("<a href=\"#{id}\">{id}</a>"));
     Page {
         title: format!("{} · rever", html(&header.run)),
-        header: head::head(header, simulators, results),
+        header: head::head(header, results),
         links: links.collect(),
         sections: shown()
             .map(|(id, title, body)| {
-                format!("<section id=\"{id}\"><h2>{title}</h2>{body}</section>\n")
+                format!("<section id=\"{id}\"><h2 tabindex=\"-1\">{title}</h2>{body}</section>\n")
             })
             .collect(),
         footer: format!("The episodes were run by {}.", html(&build)),
     }
 }
 
-fn percent_with_interval(rate: Rate) -> String {
-    let Some(value) = rate.value else { return "–".to_owned() };
-    let interval = rate.interval;
-    format!(
-        "{:.1}<small>{:.1}–{:.1}</small>",
-        value * 100.0,
-        interval.low * 100.0,
-        interval.high * 100.0
-    )
-}
-
 fn result(results: &Results) -> String {
-    let rates: String = results.settings.iter().map(rates).collect();
-    let counts: String = results.settings.iter().map(counts).collect();
     format!(
-        "<p class=\"note\">Percent of episodes with 95 % intervals, averaged over tasks, each of which counts the \
-         same. Success is read at the last step; the columns beside it count success at any step, success with the \
-         object released, and episodes in which the object was held at some step. Episodes that share an initial \
-         layout are a cluster, which widens the interval.</p>{}\
-         <p class=\"note\">Beside the rates: malformed candidates are never executed, and without a well-formed one \
-         the robot holds still. Episodes in which the policy never acted and attempts that broke (faults) have no \
-         outcome; repeats of an episode in which nothing is drawn count once.</p>{}",
-        table(
-            &["setting", "success", "at any step", "released", "ever grasped", "episodes"],
-            &rates
-        ),
-        table(
-            &["setting", "malformed candidates", "held steps", "never acted", "faults", "repeats"],
-            &counts
-        ),
+        "<p class=\"note\">Percent of episodes, averaged over tasks, each of which counts the same. Below each rate is its \
+         {}. {} is read at the last step.</p>{}<p class=\"note\">{} candidates are never executed. Without a well-formed \
+         candidate the robot holds still. Episodes in which the policy never acted are in no rate. Repeats of an episode in \
+         which nothing is drawn (T = 0) count once.</p>{}",
+        term("95 % interval"),
+        term_as("success", "Success"),
+        tables::rates(&results.settings),
+        term_as("malformed", "Malformed"),
+        tables::counts(&results.settings),
     )
-}
-
-fn table(heads: &[&str], rows: &str) -> String {
-    let heads: String = heads.iter().map(|head| format!("<th>{head}</th>")).collect();
-    format!(
-        "<div class=\"scroll\"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
-    )
-}
-
-/// A row of a table over settings; cells are HTML already.
-fn row(result: &SettingResult, cells: &[String]) -> String {
-    let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
-    let setting = result.setting;
-    format!(
-        "<tr data-strategy=\"{}\"><td>{}</td>{cells}</tr>",
-        setting.strategy,
-        html(&setting.to_string())
-    )
-}
-
-fn rates(result: &SettingResult) -> String {
-    let all = &result.all;
-    let Rate { episodes, starts, .. } = all.success;
-    let rates = [all.success, all.ever_success, all.released_success, all.grasped];
-    let mut cells: Vec<String> = rates.into_iter().map(percent_with_interval).collect();
-    cells[0] = format!("<b>{}</b>", cells[0]);
-    cells.push(match episodes == starts {
-        true => episodes.to_string(),
-        false => format!("{episodes}<small>{starts} layouts</small>"),
-    });
-    row(result, &cells)
-}
-
-fn counts(result: &SettingResult) -> String {
-    let Counts { faults, never_acted, repeats, proposed, malformed, decisions, held_steps } =
-        result.all.counts;
-    let share = |part: u64, whole: u64| format!("{part}<small>of {whole}</small>");
-    let alarming = |count: u64| match count {
-        0 => count.to_string(),
-        count => format!("<span class=\"fault\">{count}</span>"),
-    };
-    let cells = [
-        share(malformed, proposed),
-        share(held_steps, decisions),
-        alarming(never_acted),
-        alarming(faults),
-        repeats.to_string(),
-    ];
-    row(result, &cells)
 }
 
 fn gains(results: &Results) -> String {
     let comparison = |gain: &SettingGain| Comparison {
-        label: format!("{} − {}", gain.better, gain.worse),
-        episodes: gain.gain.pairs as usize,
+        better: gain.better.to_string(),
+        worse: gain.worse.to_string(),
+        strategy: gain.better.strategy.to_string(),
+        pairs: gain.gain.pairs as usize,
         gain: gain.gain.mean,
         low: gain.gain.interval.low,
         high: gain.gain.interval.high,
@@ -149,15 +86,17 @@ fn gains(results: &Results) -> String {
     let headroom = match headroom.is_empty() {
         true => String::new(),
         false => format!(
-            "<p class=\"note\">Headroom, the share of the gap between a single sample and the oracle that a setting \
-             closes: {}.</p>",
+            "<p class=\"note\">{} of the gap to the oracle: {}.</p>",
+            term_as("headroom", "Headroom"),
             headroom.join(", ")
         ),
     };
     format!(
-        "<p class=\"note\">Percentage points of success on the same initial layouts with the same random numbers, \
-         averaged over tasks, with 95 % intervals. An interval that includes 0 leaves open which of the two is \
-         better.</p>{figure}{headroom}"
+        "<p class=\"note\">The first setting minus the second, {} on the same {}s with the same random numbers and averaged \
+         over tasks. The line is the {}. A line that crosses 0 leaves open which of the two is better.</p>{figure}{headroom}",
+        term("paired"),
+        term("initial layout"),
+        term("95 % interval"),
     )
 }
 
@@ -187,26 +126,24 @@ fn candidates(results: &Results) -> String {
             };
             let start = results.settings.iter().find(is_start);
             let points = start.and_then(point).into_iter().collect();
-            let label = format!("{strategy}, T={temperature}");
-            series.push((strategy, temperature, Series { label, points }));
+            let label = format!("{strategy} T={temperature}");
+            let name = strategy.to_string();
+            series.push((strategy, temperature, Series { label, strategy: name, points }));
             series.len() - 1
         });
         series[place].2.points.extend(point(result));
     }
     // A line needs a second number of candidates beside the single sample that all share.
     series.retain(|(_, _, one)| one.points.iter().filter(|point| point.candidates > 1).count() > 1);
-    let lines = series.len();
     let figure = curve::figure(&series.into_iter().map(|(_, _, one)| one).collect::<Vec<_>>());
     if figure.is_empty() {
         return figure;
     }
-    let left_out = match lines.saturating_sub(curve::SERIES_MAX) {
-        0 => String::new(),
-        count => format!(" {count} more lines are left out here; the table of results has them."),
-    };
     format!(
-        "<p class=\"note\">Success at the last step, averaged over tasks, with 95 % intervals; one candidate is a \
-         single sample.{left_out}</p>{figure}"
+        "<p class=\"note\">Success at the last step, averaged over tasks. Vertical lines are {}s; one candidate is a {}. \
+         Lines are set apart sideways, so that none hides another.</p>{figure}",
+        term("95 % interval"),
+        term("single sample"),
     )
 }
 
@@ -232,6 +169,12 @@ fn verifier(scored: &[Scored]) -> String {
     if scored.is_empty() {
         return String::new();
     }
+    let successes = scored.iter().filter(|one| one.is_success).count();
+    if successes == 0 || successes == scored.len() {
+        return "<p class=\"note\">Scores are compared with outcomes when the run has successes and failures; so far it has \
+                only one of the two.</p>"
+            .to_owned();
+    }
     let values: Vec<f32> = scored.iter().map(|one| one.score).collect();
     let labels: Vec<bool> = scored.iter().map(|one| one.is_success).collect();
     let bins = calibration::reliability(&values, &labels, calibration::BINS);
@@ -247,9 +190,9 @@ fn verifier(scored: &[Scored]) -> String {
     let number = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
     format!(
         "<p class=\"note\">Scores of executed candidates that were {kind} ({} steps), against how \
-         their episode ended: AUROC {}, expected calibration error {}, both over all tasks at once: \
-         telling easy tasks from hard ones is part of it.</p>\
-         <div class=\"pair\">{}{}</div>",
+         their episode ended. AUROC {}, expected calibration error {}. Both are over all tasks together, so that telling \
+         easy tasks from hard ones is a part of them. The area of a dot is the number of its steps.</p>\
+         <div class=\"halves\">{}{}</div>",
         scored.len(),
         number(auroc(&values, &labels)),
         number(error),
@@ -271,26 +214,56 @@ fn tasks(results: &Results) -> String {
     if results.tasks.len() < 2 {
         return String::new();
     }
-    let figure = |(index, task): (usize, &TaskId)| {
-        let bars: Vec<Bar> = results
-            .settings
-            .iter()
-            .filter_map(|setting| bar(setting, setting.tasks[index].success))
-            .collect();
-        format!("<div><h3>{}</h3>{}</div>", html(&task_words(task)), bars::figure(&bars))
-    };
-    let figures: String = results.tasks.iter().enumerate().map(figure).collect();
-    format!("<div class=\"halves\">{figures}</div>")
+    let figures: String = results
+        .tasks
+        .iter()
+        .enumerate()
+        .map(|(index, task)| {
+            let rows: Vec<IntervalRow> =
+                results.settings.iter().filter_map(|setting| rate_row(setting, index)).collect();
+            panel(&html(&task_words(task)), &task_figure(task, &rows))
+        })
+        .collect();
+    format!(
+        "<p class=\"note\">Success at the last step with its {}.</p>{figures}",
+        term("95 % interval")
+    )
 }
 
-fn bar(result: &SettingResult, rate: Rate) -> Option<Bar> {
+fn task_figure(task: &TaskId, rows: &[IntervalRow]) -> String {
+    if rows.is_empty() {
+        return String::new();
+    }
+    let mut csv = csv_line(&["setting", "success", "low", "high", "episodes"].map(str::to_owned));
+    for row in rows {
+        let [value, low, high] = [row.value, row.low, row.high].map(|value| format!("{value:.3}"));
+        let episodes = row.count.split(' ').next().unwrap_or_default().to_owned();
+        csv.push_str(&csv_line(&[row.label.clone(), value, low, high, episodes]));
+    }
+    let described: Vec<String> =
+        rows.iter().map(|row| format!("{}: {} %", row.label, row.text)).collect();
+    let letters = |letter: char| if letter.is_ascii_alphanumeric() { letter } else { '-' };
+    let name: String = task_words(task).chars().map(letters).collect();
+    let figure = Figure {
+        name: format!("success-{name}"),
+        description: format!("Success on {}: {}", task_words(task), described.join("; ")),
+        csv,
+    };
+    let frame = Frame { low: 0.0, high: 100.0, title: "success at the last step (%)", sides: None };
+    figure.html(|room| intervals::draw(rows, &frame, room))
+}
+
+fn rate_row(result: &SettingResult, task: usize) -> Option<IntervalRow> {
+    let rate = result.tasks.get(task)?.success;
     let interval = rate.interval;
-    Some(Bar {
+    let [value, low, high] = [rate.value?, interval.low, interval.high].map(|value| 100.0 * value);
+    Some(IntervalRow {
         label: result.setting.to_string(),
         strategy: result.setting.strategy.to_string(),
-        rate: rate.value?,
-        low: interval.low,
-        high: interval.high,
-        episodes: rate.episodes as usize,
+        value,
+        low,
+        high,
+        text: format!("{value:.1} [{low:.1}, {high:.1}]"),
+        count: format!("{} episodes", rate.episodes),
     })
 }

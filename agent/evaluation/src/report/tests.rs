@@ -4,11 +4,11 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::{Report, ReportOptions, build, chosen_scores, details::Details, sample};
+use super::{Readers, Report, ReportOptions, build, chosen_scores, details::Details, sample};
 
 fn built(run: &Path, out: &Path, episodes_max: usize) -> Report {
     let options = ReportOptions { run, out, episodes_max };
-    build(&options, &sample::speak, &|_, _| ()).expect("report")
+    build(&options, &sample::readers(), &|_, _| ()).expect("report")
 }
 
 /// The value that a data file hands over.
@@ -34,11 +34,14 @@ fn every_episode_of_the_run_is_in_the_report() {
     let videos = records.iter().filter(|record| sample::has_video(record)).count();
     assert_eq!((report.videos, names(&out.join("videos")).len()), (videos, videos));
     let catalogue = value_of(&out.join("data/catalogue.js"), "window.reverCatalogue = ", ";\n");
+    let pairs = catalogue["pairs"].as_array().expect("pairs");
+    let listed = || pairs.iter().flat_map(|pair| pair["episodes"].as_array().expect("episodes"));
     for record in &records {
         let id = record.identity.id();
-        let entry =
-            catalogue["episodes"].as_array().expect("list").iter().find(|one| one["id"] == id);
-        assert_eq!(entry.expect("entry")["detail"], true);
+        let entry = listed().find(|one| one["id"] == id).expect("entry");
+        assert_eq!(entry["detail"], true);
+        let first = record.steps.iter().position(|step| step.statistics.is_success);
+        assert_eq!(entry["success"], first.map_or(Value::Null, Value::from));
         let details = value_of(&out.join(format!("data/{id}.js")), "reverEpisode(", ");\n");
         let steps = details["steps"].as_array().expect("steps");
         assert_eq!(steps.len(), record.steps.len());
@@ -128,7 +131,7 @@ fn a_run_without_episodes_is_refused_in_words() {
     let folder = tempfile::tempdir().expect("folder");
     let run = folder.path().join("run");
     let options = ReportOptions { run: &run, out: folder.path(), episodes_max: 1 };
-    let error = build(&options, &sample::speak, &|_, _| ()).expect_err("no run");
+    let error = build(&options, &sample::readers(), &|_, _| ()).expect_err("no run");
     assert!(error.to_string().contains("is not a run"), "{error:#}");
 }
 
@@ -156,8 +159,9 @@ fn chunks_and_policies_without_text_are_shown_as_they_are() {
     candidates[0].actions = Some(chunk.clone().try_into().expect("a chunk"));
     candidates[0].malformed = None;
     record.steps[1].decision = None;
-    let details =
-        Details::new(&record, &|_| panic!("there are no tokens to read")).expect("details");
+    let readers =
+        Readers { speak: &|_| panic!("there are no tokens to read"), ..sample::readers() };
+    let details = Details::new(&record, &readers).expect("details");
     let shown = serde_json::to_value(&details).expect("JSON");
     assert_eq!(shown["steps"][0]["candidates"][0]["actions"], serde_json::json!(chunk));
     assert_eq!(shown["steps"][1]["decision_ms"], Value::Null);
@@ -172,10 +176,51 @@ fn the_page_tells_malformed_candidates_and_held_steps_of_every_setting() {
     built(&run, &out, 1);
     let page = std::fs::read_to_string(out.join("index.html")).expect("page");
     let malformed: usize = sample::summaries().iter().map(|one| one.malformed as usize).sum();
-    assert!(page.contains(&format!("<dt>malformed candidates</dt><dd>{malformed}</dd>")), "{page}");
+    assert!(
+        page.contains(&format!("malformed candidates</abbr></dt><dd>{malformed}</dd>")),
+        "{page}"
+    );
     for setting in ["greedy", "sample T=1", "verifier N=5 T=1"] {
-        let rows = page.matches(&format!("<td>{setting}</td>")).count();
+        let rows = page.matches(&format!("scope=\"row\">{setting}</th>")).count();
         assert_eq!(rows, 2, "rates and counts of {setting}");
     }
     assert!(page.contains("21.5 ms in batches of 4"), "a decision's own time");
+}
+
+#[test]
+fn candidates_have_the_largest_terms_of_their_score_or_the_reason_why_not() {
+    let readers = sample::readers();
+    let records = sample::records();
+    let find = |candidates| records.iter().find(|one| one.identity.candidates == candidates);
+    let details = |candidates| {
+        let details = Details::new(find(candidates).expect("a record"), &readers);
+        serde_json::to_value(details.expect("details")).expect("JSON")
+    };
+    let single = details(1);
+    assert_eq!(single["no_terms"], "one candidate has no siblings");
+    let chosen = details(5);
+    let step = &chosen["steps"][0]["candidates"];
+    let terms: Vec<&Value> = step
+        .as_array()
+        .expect("candidates")
+        .iter()
+        .filter(|one| one["malformed"].is_null())
+        .map(|one| &one["terms"])
+        .collect();
+    assert_eq!(*terms[0], serde_json::json!([[[1, -0.2]], 0.0]), "terms of 0 are not listed");
+    assert_eq!(*terms[2], serde_json::json!([[[0, 2.0], [1, -0.2]], 0.0]));
+}
+
+#[test]
+fn a_page_without_scripts_says_so_and_keeps_its_tables_and_figures() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (run, out) = (folder.path().join("run"), folder.path().join("report"));
+    sample::write(&run).expect("run");
+    built(&run, &out, 1);
+    let page = std::fs::read_to_string(out.join("index.html")).expect("page");
+    assert!(page.contains("<noscript>") && page.contains("id=\"viewer\" hidden"));
+    for part in ["role=\"table\"", "data-name=\"paired-gains\"", "class=\"glossary\""] {
+        assert!(page.contains(part), "{part}");
+    }
+    assert!(!page.contains(" style="), "the page's policy forbids styles in attributes");
 }

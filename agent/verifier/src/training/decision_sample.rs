@@ -71,7 +71,10 @@ pub fn read(
 
 /// The candidate as the policy proposed it; its hidden state is empty if the record does not
 /// contain it.
-fn candidate(record: &CandidateRecord, reader: CompletionReader<'_>) -> anyhow::Result<Candidate> {
+pub fn candidate(
+    record: &CandidateRecord,
+    reader: CompletionReader<'_>,
+) -> anyhow::Result<Candidate> {
     let CandidateRecord { tokens, log_probabilities, actions, malformed, hidden, .. } = record;
     let (parsed, confidence) = match actions {
         None => (Err(Malformed::new(malformed.clone().unwrap_or_default())), Vec::new()),

@@ -12,7 +12,7 @@
 //! The same episodes, options and seed give the same file.
 
 // Training data.
-mod decision_sample;
+pub(crate) mod decision_sample;
 mod eligibility;
 pub mod records;
 mod set;
