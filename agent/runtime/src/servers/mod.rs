@@ -32,4 +32,4 @@ pub use python::{
     simulators_environment,
 };
 pub use source::{Deployment, LocalSource, ServerSource};
-pub use system_packages::GL_PACKAGES;
+pub use system_packages::{GL_PACKAGES, install_missing};

@@ -22,11 +22,7 @@ pub(super) const PYTHON_PACKAGES: [&str; 2] = ["python3", "python3-venv"];
 /// Installs missing packages with apt, as root; returns whether there were any. If that is
 /// impossible or not wanted, the error contains the command to run. `variables` are the environment
 /// variables of all commands.
-pub(super) fn install_missing(
-    packages: &[&str],
-    variables: &Variables,
-    missing: Missing,
-) -> Result<bool> {
+pub fn install_missing(packages: &[&str], variables: &Variables, missing: Missing) -> Result<bool> {
     let Some(lacking) = lacking(packages, variables)? else {
         bail!("install this system's equivalents of the Debian packages {}", packages.join(" "));
     };
