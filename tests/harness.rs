@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use runtime::servers::{
     Host, Installation, LocalSource, Missing, PythonEnvironment, ServerProgram, Simulator,
-    development_environment,
+    development_environment, install_missing,
 };
 
 /// How often a condition is checked while a test waits for it.
@@ -54,6 +54,18 @@ pub fn python() -> &'static PythonEnvironment {
 pub fn installation() -> Installation {
     let variables = std::env::vars_os().collect();
     Installation::checkout(repository(), &Host { variables, ..Host::default() })
+}
+
+/// Installs Debian's Chromium if this machine has no browser and this is root; otherwise the test says
+/// what to install.
+pub fn ensure_browser() {
+    let path = std::env::var_os("PATH").expect("there is a PATH");
+    let is_there =
+        |name: &str| std::env::split_paths(&path).any(|folder| folder.join(name).is_file());
+    if !["chromium", "chromium-browser", "google-chrome"].into_iter().any(is_there) {
+        let variables = std::env::vars_os().collect();
+        install_missing(&["chromium"], &variables, Missing::Install).expect("a browser");
+    }
 }
 
 /// A simulator; it is installed or built if necessary.

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use crate::evaluation::Evaluation;
-use crate::harness::{python, repository, rever, run, succeed, text};
+use crate::harness::{ensure_browser, python, repository, rever, run, succeed, text};
 
 /// The shipped verifier wins some of these pairs, which are the same in every run.
 const ARGUMENTS: [&str; 8] = [
@@ -22,6 +22,7 @@ const ARGUMENTS: [&str; 8] = [
 
 #[test]
 fn the_page_of_a_run_works_in_a_browser() {
+    ensure_browser();
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("report-page");
     if folder.exists() {
         std::fs::remove_dir_all(&folder).expect("the last run's files can be removed");
