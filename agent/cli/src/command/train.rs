@@ -33,7 +33,6 @@ const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
   rever train --policy FOLDER --out FOLDER/verifier.safetensors      found beside the policy from then on")]
 pub struct Arguments {
     /// Runs to train on; every episode in them must be eligible [default: the label store]
-    #[arg(value_parser = run_folder)]
     runs: Vec<PathBuf>,
     /// Label store to train on; episodes that are not eligible are excluded and counted
     #[arg(long, default_value = "runs/labels.sqlite", conflicts_with = "runs")]
@@ -109,6 +108,9 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let started = Instant::now();
     let options = options(&arguments)?;
     options.check().map_err(|error| WrongUsage(error.to_string()))?;
+    for folder in &arguments.runs {
+        store::run::read_header(folder).map_err(|error| WrongUsage(format!("{error:#}")))?;
+    }
     let parser = CompletionParser::load(&policy_folder(arguments.policy.as_ref(), host)?)?;
     let action_space = parser.action_space();
     let (episodes, excluded) = read(&arguments, &parser, &action_space)?;
@@ -140,13 +142,6 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         Some(name) => publish(&arguments, name, &verifier),
         None => Ok(()),
     }
-}
-
-/// Parses the folder of a run.
-fn run_folder(text: &str) -> Result<PathBuf, String> {
-    let folder = PathBuf::from(text);
-    store::run::read_header(&folder).map_err(|error| format!("{error:#}"))?;
-    Ok(folder)
 }
 
 fn read(
