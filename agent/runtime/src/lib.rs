@@ -9,6 +9,7 @@
 
 // One run from start to end.
 pub mod experiment;
+pub mod replay;
 pub mod rollout;
 pub mod stop;
 

@@ -1,6 +1,7 @@
 //! `rever report`: builds the page of a run, which opens from disk in any browser.
 
 mod terms;
+mod videos;
 
 use std::path::{Path, PathBuf};
 
@@ -8,15 +9,18 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::files::policy_folder;
+use crate::files::{installation, policy_folder};
 use evaluation::report::{self, Readers, Report, ReportOptions, Speech};
-use runtime::servers::Host;
+use runtime::servers::{Host, LocalSource, Simulator};
 use store::run;
 use terms::ScoreTerms;
 use vla::CompletionParser;
 
 /// Episodes whose steps are written unless told otherwise: some 100 MB at the most.
 pub const EPISODES_MAX: usize = 1000;
+
+/// Servers that render videos: one per core of a small machine.
+const SERVERS: usize = 2;
 
 /// Build the page of a run: figures, tables, and every episode with its candidates
 #[derive(Debug, Args)]
@@ -37,6 +41,16 @@ pub struct Arguments {
     /// Episodes whose steps are written; those with videos come first
     #[arg(long, default_value_t = EPISODES_MAX)]
     episodes_max: usize,
+    /// Render the episodes that have no video, from their records, into the run's folder; takes about as long as the
+    /// simulator needs for their steps
+    #[arg(long)]
+    video: bool,
+    /// The simulator that renders: the one that the run was made with
+    #[arg(long, value_enum, default_value_t, requires = "video")]
+    simulator: Simulator,
+    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    #[arg(long, value_name = "FILE", requires = "video")]
+    python: Option<PathBuf>,
     /// Also write what was made to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
@@ -46,6 +60,16 @@ pub struct Arguments {
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let out = arguments.out.unwrap_or_else(|| arguments.run.join("report"));
     let policy = policy_folder(arguments.policy.as_ref(), host)?;
+    if arguments.video {
+        let local = LocalSource {
+            count: SERVERS,
+            simulator: arguments.simulator,
+            python: arguments.python,
+            installation: installation(host)?,
+        };
+        let made = videos::render(&arguments.run, local, arguments.episodes_max)?;
+        println!("rendered {made} videos");
+    }
     let options =
         ReportOptions { run: &arguments.run, out: &out, episodes_max: arguments.episodes_max };
     let report = build_with(&options, &policy, arguments.verifier.as_deref())?;
@@ -84,8 +108,7 @@ fn build_with(
     let explain = |record: &_| terms.of(record);
     let readers = Readers { speak: &speak, terms: terms.names(), explain: &explain };
     let bar = ProgressBar::no_length().with_prefix("report");
-    let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {eta}");
-    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar.set_style(bar_style());
     let progress = |done: usize, total: usize| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
@@ -93,6 +116,11 @@ fn build_with(
     let report = report::build(options, &readers, &progress);
     bar.finish_and_clear();
     report
+}
+
+fn bar_style() -> ProgressStyle {
+    let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {eta}");
+    style.unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
 /// Where the report is and what is in it.

@@ -156,6 +156,7 @@ impl Catalogue {
     }
 
     /// All episodes, those that only broke included.
+    #[cfg(test)]
     pub fn episodes(&self) -> impl Iterator<Item = &Entry> {
         self.pairs.iter().flat_map(|pair| &pair.episodes)
     }

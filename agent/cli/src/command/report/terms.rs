@@ -7,7 +7,7 @@ use decision::{ActionSpace, probability};
 use evaluation::report::EpisodeTerms;
 use store::record::{DecisionRecord, EpisodeRecord};
 use verifier::training::records::CompletionReader;
-use verifier::{DecisionTerms, LOGITS_PER_PROBABILITY, Verifier, explain, term_names};
+use verifier::{LOGITS_PER_PROBABILITY, Verifier, explain, term_names};
 use vla::CompletionParser;
 
 /// The verifier's file in a policy's folder.
@@ -91,7 +91,7 @@ impl<'a> ScoreTerms<'a> {
 }
 
 /// Whether the terms give the recorded scores: the mean of the logits is the situation's, the terms are all that differs.
-fn agree(decision: &DecisionRecord, terms: &DecisionTerms) -> Result<()> {
+fn agree(decision: &DecisionRecord, terms: &[Vec<f32>]) -> Result<()> {
     let well_formed = decision.candidates.iter().filter(|one| one.actions.is_some());
     let scores: Vec<f64> = well_formed.filter_map(|one| one.score).map(f64::from).collect();
     ensure!(
@@ -137,10 +137,9 @@ mod tests {
         let candidates = [0.5_f32, 0.9].map(candidate).to_vec();
         let decision = DecisionRecord { candidates, chosen: Some(1), batch_ms: 1.0, batch_size: 1 };
         // A logit of 0.2 is an advantage of 0.05.
-        agree(&decision, &vec![vec![-0.07, 0.02], vec![0.0, 0.05]]).expect("they give the scores");
-        let error =
-            agree(&decision, &vec![vec![0.05, 0.0], vec![-0.05, 0.0]]).expect_err("swapped");
+        agree(&decision, &[vec![-0.07, 0.02], vec![0.0, 0.05]]).expect("they give the scores");
+        let error = agree(&decision, &[vec![0.05, 0.0], vec![-0.05, 0.0]]).expect_err("swapped");
         assert!(error.to_string().starts_with("expected a score of 0.6225"), "{error}");
-        assert!(agree(&decision, &vec![vec![0.0]]).is_err(), "a candidate is missing");
+        assert!(agree(&decision, &[vec![0.0]]).is_err(), "a candidate is missing");
     }
 }

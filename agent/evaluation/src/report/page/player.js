@@ -7,7 +7,7 @@ const LOADED_MAX = 12;
 const waiting = new Map();
 // A video may be this far from the clock before it is moved, in seconds.
 const DRIFT_MAX = 0.15;
-const NO_VIDEO = "No video was stored for this episode. Its steps, candidates and scores are complete.";
+const NO_VIDEO = "No video was stored for this episode. Render it from the record: rever report RUN --video";
 
 // A page opened from disk may not fetch, but it may add a script that hands over its data.
 function loadSteps(id) {
@@ -155,12 +155,12 @@ class Side {
   }
 }
 
-// When an episode grasped and succeeded, and what it came to.
+// What an episode came to, and when it first grasped and first succeeded.
 function describeOutcome(entry) {
-  const text = OUTCOMES[entry.outcome][1];
-  const parts = [];
-  if (entry.grasp !== undefined) parts.push(`grasped at step ${entry.grasp}`);
-  if (entry.success !== undefined) parts.push(`succeeded at ${entry.success}`);
+  const at = (step) => (step === undefined ? "" : ` (step ${step})`);
+  const isSuccess = entry.success !== undefined;
+  const parts = [`${OUTCOMES[entry.outcome][1]}${at(isSuccess ? entry.success : entry.grasp)}`];
+  if (isSuccess && entry.grasp !== undefined) parts.push(`grasp${at(entry.grasp)}`);
   if (entry.faults) parts.push(`${entry.faults} ${entry.faults === 1 ? "fault" : "faults"}`);
-  return parts.length > 0 ? `${text} · ${parts.join(" · ")}` : text;
+  return parts.join(" · ");
 }

@@ -3,8 +3,8 @@
 
 // The slope of the logit where success and failure are equally likely.
 const LOGITS_PER_PROBABILITY = 4;
-const LANES = { score: [4, 40], advantage: [48, 88], grasped: [94, 100], success: [103, 109] };
-const STRIP_HEIGHT = 112;
+const LANES = { score: [4, 40], advantage: [48, 88], grasped: [94, 100], success: [107, 113] };
+const STRIP_HEIGHT = 116;
 
 function logit(score) {
   const inside = Math.min(Math.max(score, 1e-8), 1 - 1e-8);

@@ -101,7 +101,7 @@ class Viewer {
   showVerdict(pair) {
     const result = this.rightSetting === null ? null : this.list.result(pair);
     const names = [this.leftSetting, this.rightSetting].map((setting) => this.catalogue.settings[setting]?.name);
-    const texts = { won: `${names[0]} succeeded, ${names[1]} did not`, lost: `${names[1]} succeeded, ${names[0]} did not`, both: "both succeeded", neither: "neither succeeded" };
+    const texts = { won: `only ${names[0]} succeeded`, lost: `only ${names[1]} succeeded`, both: "both succeeded", neither: "neither succeeded" };
     byId("verdict").textContent = texts[result] ?? "";
     byId("verdict").className = result === null ? "" : `badge ${result}`;
   }
