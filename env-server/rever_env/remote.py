@@ -65,9 +65,9 @@ class RemoteEnv(gymnasium.Env[Fields, NDArray[np.float32]], EzPickle):
     Reward, termination and truncation: those of the served environment.
 
     Info of step(): the flags of BridgeEnv. Of environments other than the Bridge tasks only
-    is_success and ever_success are known, and the other flags are False. action_followed exists
-    only for actions that are Bridge's. Info of reset(): seed, int. Both: expert_action, float32
-    (n,), with expert=True.
+    is_success and ever_success are known: source_on_target equals is_success, and the other flags
+    are False. action_followed exists only where state and action are those of a Bridge task.
+    Info of reset(): seed, int. With expert=True both have expert_action, float32 (n,).
 
     Raises:
         RemoteFault: the environment or the connection broke. It is never a reward. reset() begins a

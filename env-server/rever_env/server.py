@@ -4,6 +4,7 @@ zenoh callback -> inbox -> simulation thread -> session -> outbox. Neither zenoh
 simulation thread block on a peer. The simulation thread owns the rendering contexts.
 """
 
+import contextlib
 import logging
 import os
 import secrets
@@ -274,8 +275,8 @@ def resident_bytes() -> int:
 
 
 def metadata_version() -> str:
-    """The version of the installed package; "checkout" if it is not installed."""
-    try:
-        return metadata.version("rever_env")
-    except metadata.PackageNotFoundError:
-        return "checkout"
+    """The version of the installed package, or of the wheel rever that holds it; or "checkout"."""
+    for distribution in ("rever_env", "rever"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            return metadata.version(distribution)
+    return "checkout"

@@ -154,7 +154,7 @@ def test_an_environment_without_an_instruction_has_its_id() -> None:
 def test_a_camera_that_is_not_served_is_named(caplog: pytest.LogCaptureFixture) -> None:
     task = cup()
     assert "serving the image front of its observation, not images.wrist" in caplog.text
-    assert "text language of its observation is the instruction, and not task" in caplog.text
+    assert "text language of its observation as the instruction, not task" in caplog.text
     assert GymnasiumWorld(task, 4, 6).reset(layout=None, seed=0).image.max() == 1
     names = [dimension.name.split("[")[0] for dimension in task.state]
     assert names == ["observation.joints"] * 2 + ["observation.state"] * 3

@@ -27,6 +27,16 @@ def test_the_wheel_of_the_program_requires_what_the_package_requires(key: str) -
     assert wheel[key] == package[key]
 
 
+def test_the_wheel_of_the_program_has_the_extras_of_the_package() -> None:
+    package, wheel = (project(folder)["optional-dependencies"] for folder in FOLDERS)
+    del package["development"]
+    extras = {
+        name: [one.replace("rever_env[", "rever[") for one in requirements]
+        for name, requirements in package.items()
+    }
+    assert wheel == extras
+
+
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_the_files_that_the_metadata_name_exist(folder: Path) -> None:
     named = project(folder)

@@ -1,6 +1,8 @@
 //! The Python that a wheel installed this program into, together with the packages that servers need.
 //!
-//! `pip install rever-*.whl` puts the program into `PREFIX/bin`, and says so in `PREFIX/lib/pythonX.Y/site-packages`.
+//! `pip install rever-*.whl` puts the program into `PREFIX/bin`, and a record into `PREFIX/lib/pythonX.Y/site-packages`.
+//! This Python provides the dependencies; the package `rever_env` itself comes from the program's own files, so that it is
+//! always of the same build.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -10,13 +12,13 @@ use anyhow::{Context, Result, ensure};
 use super::installation::{Installation, Missing};
 use super::python::{PythonEnvironment, last_lines};
 
-/// pip records an installed wheel in the folder `rever-VERSION.dist-info`; Debian's pip calls the folder around it otherwise.
+/// pip records an installed wheel in the folder `rever-VERSION.dist-info`. Debian's pip has another name for its parent.
 const PACKAGE_FOLDERS: [&str; 2] = ["site-packages", "dist-packages"];
 const RECORD_START: &str = "rever-";
 const RECORD_END: &str = ".dist-info";
-/// Names the requirements of the wheel that this Python does not meet. pip checks lower bounds when it installs; the versions
-/// that are pinned decide what a simulation computes, so that they are compared each time. A requirement with a condition is
-/// for an extra or for an older Python.
+/// Prints the requirements of the wheel that this Python does not meet. pip checks lower bounds on installation. Pinned
+/// versions decide what a simulation computes, so that they are compared each time. A requirement with a condition belongs
+/// to an extra or to an older Python.
 const COMPARE_REQUIREMENTS: &str = r"
 import re
 from importlib import metadata
@@ -34,10 +36,10 @@ for requirement in metadata.requires('rever') or []:
         wrong.append(f'{requirement} (found {found})')
 print(', '.join(wrong))
 ";
-/// In the folder of the unpacked files: the Python that has rendered an image.
+/// The file beside the unpacked ones that names the Python which has rendered an image.
 const RENDERED_BY: &str = "rendered-by";
 
-/// The Python of the wheel that this program comes from. None where no wheel installed it, or where a package is missing.
+/// The Python of the wheel that this program comes from. None if no wheel installed it, or if a package is missing.
 pub(super) fn environment(
     installation: &Installation,
     missing: Missing,
@@ -62,7 +64,7 @@ pub(super) fn environment(
     Ok(Some(environment))
 }
 
-/// Beside the program, or on PATH where a user's or a system's programs lie apart from their Python.
+/// Beside the program; on PATH if pip keeps programs apart from their Python, as `pip install --user` does.
 fn python_of(program: &Path, path: Option<&OsStr>) -> Option<PathBuf> {
     let bin = program.parent()?;
     let version = python_with_record(&bin.parent()?.join("lib"))?;
@@ -96,7 +98,7 @@ fn compare_requirements(environment: &PythonEnvironment) -> Result<()> {
     Ok(())
 }
 
-/// pip installs no system packages.
+/// Installs software OpenGL if it is missing, because pip installs no system packages.
 fn ensure_rendering_once(
     environment: &PythonEnvironment,
     installation: &Installation,
@@ -106,6 +108,10 @@ fn ensure_rendering_once(
     if std::fs::read(&stamp).is_ok_and(|found| found == python.as_encoded_bytes()) {
         return Ok(());
     }
+    eprintln!(
+        "servers use the Python that rever was installed into: {}",
+        environment.python.display()
+    );
     environment.ensure_rendering(installation, Missing::Install)?;
     std::fs::write(&stamp, python.as_encoded_bytes())
         .with_context(|| format!("cannot write {}", stamp.display()))
