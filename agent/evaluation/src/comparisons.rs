@@ -5,7 +5,7 @@ use decision::{Setting, Strategy};
 use crate::counted::{SettingEpisodes, in_common};
 use crate::estimate::{self, Gain, Headroom};
 
-/// The setting that the program runs unless told otherwise: what a run's headline is about.
+/// The default setting of the program: the subject of a run's headline.
 pub const DEFAULT_SETTING: Setting =
     Setting { strategy: Strategy::Verifier, candidates: 5, temperature: 1.0 };
 

@@ -106,7 +106,7 @@ pub struct Paired {
 pub struct Headroom {
     /// The strategy in question.
     pub strategy: String,
-    /// Candidates per step, of the oracle, too.
+    /// Candidates per step, the same for the oracle.
     pub candidates: u32,
     /// Sampling temperature of all three.
     pub temperature: f32,

@@ -112,7 +112,7 @@ pub struct DecisionBench<'a> {
 }
 
 impl DecisionBench<'_> {
-    /// Times every setting, and PyTorch's, in turns.
+    /// Measures every setting and PyTorch's, alternately.
     pub fn run(&self, mut torch: Option<Torch>, mut progress: impl FnMut(usize)) -> Result<Report> {
         ensure!(self.rounds > 0, "rounds: expected at least 1, got 0");
         let settings = settings();

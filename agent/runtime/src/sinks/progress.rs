@@ -1,4 +1,4 @@
-//! Live progress with an estimate: a bar in a terminal, plain lines elsewhere.
+//! Live progress with the estimated time left: a bar in a terminal, plain lines elsewhere.
 
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
@@ -12,14 +12,14 @@ use super::{Event, EventSink};
 
 /// How often a plain line is printed where there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
-/// Faults for the same reason within this time are told together: a lost server breaks all of its episodes.
+/// Faults with the same reason within this time are reported together: a lost server breaks all of its episodes.
 const SAME_FAULT: Duration = Duration::from_secs(2);
-/// More strategies than this are told together, in one rate.
+/// The rates of more strategies than this are shown as one.
 const RATES_MAX: usize = 3;
-/// Ticks of the bar: progress is counted in control steps, whose final number is not known.
+/// Ticks of the bar. Progress is counted in control steps, whose final number is unknown.
 const TICKS: u64 = 10_000;
 
-/// What a run has done since it was started.
+/// Work done since the start of this process.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Control steps of all episodes.
@@ -28,18 +28,18 @@ pub struct Counts {
     pub episodes: u64,
 }
 
-/// How far a run has come. Episodes that were recorded before this start count as done, but not for the estimate.
+/// Progress of a run. Episodes recorded by an earlier process count as done, but not for the estimate.
 pub struct Progress {
     bar: Option<ProgressBar>,
     is_silent: bool,
-    /// Episodes that were recorded before this start.
+    /// Episodes recorded by an earlier process.
     before: u64,
     /// Episodes to record.
     waiting: u64,
     counts: watch::Sender<Counts>,
-    /// Steps of the episodes that were recorded since the start.
+    /// Steps of the episodes recorded by this process.
     steps_recorded: u64,
-    /// Steps of an episode, as long as none is recorded.
+    /// Steps per episode, used until one is recorded.
     steps_expected: f64,
     rates: Vec<StrategyRate>,
     faults: u64,
@@ -55,7 +55,7 @@ struct StrategyRate {
     episodes: u64,
 }
 
-/// The last reason that was told, and how many more episodes have broken for it.
+/// The last reported reason, and the number of further episodes that broke for it.
 struct LastFault {
     reason: String,
     at: Instant,
@@ -89,14 +89,14 @@ impl Progress {
         }
     }
 
-    /// Shows nothing but faults and notices.
+    /// Shows only faults and notices.
     pub fn silent(mut self) -> Progress {
         self.bar = None;
         self.is_silent = true;
         self
     }
 
-    /// An episode that was recorded before this start.
+    /// Counts an episode recorded by an earlier process.
     pub fn recorded_before(&mut self, identity: &EpisodeIdentity, is_success: bool) {
         self.before += 1;
         self.count(identity, is_success);
@@ -118,20 +118,20 @@ impl Progress {
         self.rates[index].successes += u64::from(is_success);
     }
 
-    /// One control step of one episode is over.
+    /// Counts one control step.
     fn stepped(&mut self) {
         self.counts.send_modify(|counts| counts.steps += 1);
         self.show();
     }
 
-    /// An episode of so many steps is recorded.
+    /// Counts a recorded episode with its steps.
     fn recorded(&mut self, steps: usize) {
         self.counts.send_modify(|counts| counts.episodes += 1);
         self.steps_recorded += steps as u64;
         self.show();
     }
 
-    /// An attempt broke.
+    /// Counts and reports a fault.
     fn faulted(&mut self, episode: &str, reason: &str) {
         self.faults += 1;
         if let Some(last) = &mut self.last_fault
@@ -141,14 +141,14 @@ impl Progress {
             last.others += 1;
             return;
         }
-        self.tell_others();
+        self.report_others();
         self.say(&format!("fault: {reason} ({episode} is retried)"));
         self.last_fault =
             Some(LastFault { reason: reason.to_owned(), at: Instant::now(), others: 0 });
     }
 
-    /// How many more episodes broke for the reason that was told.
-    fn tell_others(&mut self) {
+    /// Reports how many further episodes broke for the last reason.
+    fn report_others(&mut self) {
         if let Some(LastFault { others: others @ 1.., .. }) = self.last_fault.take() {
             self.say(&format!("the same fault in {others} more episodes, which are retried"));
         }
@@ -164,7 +164,7 @@ impl Progress {
 
     fn show(&mut self) {
         if self.last_fault.as_ref().is_some_and(|last| last.at.elapsed() >= SAME_FAULT) {
-            self.tell_others();
+            self.report_others();
         }
         if self.is_silent {
             return;
@@ -179,7 +179,7 @@ impl Progress {
         }
     }
 
-    /// Steps of one episode: measured, as soon as one is recorded.
+    /// Steps per episode: measured once one is recorded.
     fn steps_each(&self) -> f64 {
         match self.counts.borrow().episodes {
             0 => self.steps_expected,
@@ -187,15 +187,15 @@ impl Progress {
         }
     }
 
-    /// Control steps that are still to be done.
+    /// Control steps left.
     fn steps_left(&self) -> f64 {
         let Counts { steps, episodes } = *self.counts.borrow();
-        // Counted in steps: episodes that began together end together, so their own rate comes in waves.
+        // Episodes that start together end together, so a rate of episodes comes in waves.
         let ahead = steps.saturating_sub(self.steps_recorded) as f64;
         (self.waiting.saturating_sub(episodes) as f64 * self.steps_each() - ahead).max(0.0)
     }
 
-    /// What is done of the whole run, 0 to 1.
+    /// The completed share of the run, 0 to 1.
     fn share(&self) -> f64 {
         let whole = (self.before + self.waiting) as f64 * self.steps_each();
         1.0 - self.steps_left() / whole.max(1.0)
@@ -250,7 +250,7 @@ impl EventSink for Progress {
 
     /// Leaves the last state on the screen.
     fn finish(&mut self) -> Result<()> {
-        self.tell_others();
+        self.report_others();
         let line = self.line(self.started.elapsed());
         match &self.bar {
             Some(bar) => {
@@ -324,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn faults_for_one_reason_are_told_together() {
+    fn faults_with_one_reason_are_reported_together() {
         let mut progress = Progress::new("test", 10, 20.0);
         for episode in 0..8 {
             progress.faulted(&identity("sample", episode).id(), "server 27f5 is gone");

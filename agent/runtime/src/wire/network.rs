@@ -16,11 +16,11 @@ use super::local_endpoint::{ANY_LOOPBACK_PORT, local_endpoint};
 
 /// Another process may take a port between its choice and its use.
 const PORT_ATTEMPTS_MAX: usize = 10;
-/// A client waits this long for the router or server that it is told to connect to.
+/// Timeout for the zenoh handshake with a router or server.
 const CLIENT_WAIT_MS: u32 = 10_000;
-/// A router or server that is being started, too, may listen a little later.
+/// Timeout for the TCP connection: a router or server that is starting may listen a little later.
 const LISTENER_WAIT: Duration = Duration::from_secs(5);
-/// Between two attempts to connect to it.
+/// Pause between two attempts to connect.
 const LISTENER_PAUSE: Duration = Duration::from_millis(250);
 /// For zenoh's threads and sockets and a few servers' pipes.
 const OPEN_FILES_MIN: u64 = 64;
@@ -197,8 +197,8 @@ pub fn check_endpoint(endpoint: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// An error where a host's name is unknown or nothing listens at any of the endpoints. zenoh would retry both for as long as
-/// it may, and then not say which of them it was.
+/// Fails if a host name is unknown or nothing listens at any of the endpoints. zenoh would retry both until its timeout and
+/// report neither.
 async fn check_connections(endpoints: &[String]) -> anyhow::Result<()> {
     let addresses: Vec<&str> =
         endpoints.iter().filter_map(|endpoint| endpoint.strip_prefix("tcp/")).collect();
