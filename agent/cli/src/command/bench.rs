@@ -192,7 +192,7 @@ fn wire(arguments: WireArguments, host: &Host) -> Result<()> {
     print_table(&head, rows.iter().map(row));
     println!(
         "Medians in ms per step over all sessions, {side} x {side} pixels, one server per simulator. wire: step minus\n\
-         simulator; share: wire / step; repeat: the last reply sent again; bare: as many bytes through a socket; kB: reply"
+         simulator; share: wire / step; repeat: last reply resent; bare: as many bytes through a socket; kB: reply size"
     );
     Ok(())
 }
@@ -357,7 +357,8 @@ fn print(report: &Report) {
     print_table(&head, report.rows.iter().map(row));
     let megabytes = report.rows.first().map_or(0.0, |row| row.weight_bytes as f64 / 1e6);
     println!(
-        "{} decisions per row, {} threads. A token step reads {megabytes:.1} MB of weights;\nthis machine reads a buffer of that size at {:.1} GB/s.",
+        "{} decisions per row, {} threads. A token step reads {megabytes:.1} MB of weights;\n\
+         this machine reads a buffer of that size at {:.1} GB/s.",
         report.decisions,
         report.threads,
         report.bandwidth_bytes_per_second / 1e9,

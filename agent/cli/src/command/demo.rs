@@ -45,7 +45,7 @@ pub struct Arguments {
 pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let started = Instant::now();
     println!(
-        "{} random initial layouts per task, each run with a single sample and with the verifier's choice of {CANDIDATES}",
+        "{} random initial layouts per task, each run with a single sample and with the verifier (N = {CANDIDATES})",
         arguments.episodes
     );
     let setting = |strategy| Setting::new(strategy, CANDIDATES, TEMPERATURE);

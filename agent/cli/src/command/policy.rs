@@ -12,8 +12,8 @@ pub fn load(folder: &Path, device: DeviceName) -> Result<Vla> {
     let name = folder.display();
     if !folder.is_dir() {
         return Err(WrongUsage(format!(
-            "--policy: expected a checkpoint's folder, but {name} is not a folder; download a checkpoint from the Hugging Face \
-             Hub with `hf download OWNER/NAME --local-dir FOLDER`"
+            "--policy: expected a checkpoint's folder, but {name} is not a folder; download a checkpoint from the \
+             Hugging Face Hub with `hf download OWNER/NAME --local-dir FOLDER`"
         ))
         .into());
     }

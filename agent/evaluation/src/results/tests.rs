@@ -294,7 +294,7 @@ fn the_headline_names_the_default_setting_and_what_is_open() {
     summaries.retain(|one| one.identity.candidates < 5);
     let text = Headline::new(&results(&summaries)).expect("a headline").text();
     assert!(text.contains("among 2 candidates"), "the nearest that there is: {text}");
-    assert!(text.contains("Not clear yet: the interval includes 0. If the gain is of"), "{text}");
+    assert!(text.contains("Not clear yet: the interval includes 0. About "), "{text}");
     summaries.retain(|one| one.identity.candidates < 2);
     let text = Headline::new(&results(&summaries)).expect("a headline").text();
     let expected = "A single sample (sample T=1) succeeds in 33.3 % of episodes (95 % interval 9.7 to 70.0, 6 episodes).";
