@@ -30,8 +30,8 @@ pub struct SettingHeadroom {
     pub headroom: Headroom,
 }
 
-/// The verifier against every cheaper strategy, the verifier with agreement against both of its parts, and the first
-/// well-formed candidate against a single sample: the gain from discarding malformed candidates alone.
+/// The gains of `verifier` and `verifier-medoid` over all other strategies but the oracle, of `verifier-medoid` over
+/// `verifier`, and of `first-well-formed` over `sample`: the gain from discarding malformed candidates alone.
 pub fn gains(settings: &[SettingEpisodes<'_>]) -> Vec<SettingGain> {
     let mut gains = Vec::new();
     for better in settings {
@@ -62,7 +62,7 @@ fn is_compared(better: Setting, worse: Setting) -> bool {
     }
 }
 
-/// The headroom of every setting that chooses among candidates, if a single sample and the oracle were run too.
+/// The headroom of every setting that chooses among candidates, if the run has a single sample and the oracle.
 pub fn headroom(settings: &[SettingEpisodes<'_>]) -> Vec<SettingHeadroom> {
     let find = |strategy: Strategy, candidates: u32, temperature: f32| {
         let wanted = Setting { strategy, candidates, temperature };

@@ -1,8 +1,8 @@
 //! Selects the episodes that count, and groups them into clusters.
 //!
-//! Episodes of one task with the same initial layout share a start. At temperature 0 nothing is sampled: all episodes of a
-//! start are identical, and only the first counts. At other temperatures the episodes of a start are a cluster. An episode
-//! in which the policy never acted has no outcome.
+//! Episodes of one task with the same initial layout share a start. At temperature 0 nothing is sampled: all episodes
+//! of a start are identical, and only the first counts. At other temperatures the episodes of a start are a cluster. An
+//! episode in which the policy never acted has no outcome.
 
 use std::collections::{BTreeMap, BTreeSet};
 

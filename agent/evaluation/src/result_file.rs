@@ -20,7 +20,7 @@ pub struct ResultFile {
     pub rows: Vec<Row>,
     /// One entry per comparison.
     pub paired: Vec<Paired>,
-    /// One entry per setting that chooses among candidates, if a single sample and the oracle were run too.
+    /// One entry per setting that chooses among candidates, if the run has a single sample and the oracle.
     pub headroom: Vec<Headroom>,
     /// Time per decision: its share of its batch's time. `None` without decisions.
     pub decision_ms: Option<StepTime>,
@@ -121,8 +121,8 @@ pub struct Headroom {
 }
 
 impl ResultFile {
-    /// The file's contents. `made_from` is an object such as a run's header, with the command line, the build's commit and
-    /// the date added.
+    /// The file's contents. `made_from` is an object such as a run's header with the command line, the build's commit
+    /// and the date added.
     pub fn new(results: &Results, made_from: Value) -> Result<ResultFile> {
         ensure!(made_from.is_object(), "result file: expected an object, got {made_from}");
         let mut rows = Vec::new();

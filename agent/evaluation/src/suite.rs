@@ -37,8 +37,8 @@ pub struct Suite {
 }
 
 impl Suite {
-    /// The episodes. Tasks alternate, so that a partial run covers all tasks equally. An error if fixed layouts are asked
-    /// for and a task has none.
+    /// The episodes. Tasks alternate, so that a partial run covers all tasks equally. An error if a task has no fixed
+    /// layouts and is to be run on them.
     pub fn episodes(&self) -> anyhow::Result<Vec<EpisodePlan>> {
         let numbers = 0..self.episodes;
         numbers

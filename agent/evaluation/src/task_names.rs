@@ -23,8 +23,8 @@ pub fn short_names(tasks: &[TaskId]) -> Vec<String> {
 }
 
 /// The offered task with this name: its full name, or consecutive words of it that no other task's name contains
-/// (`stack`, `stack_cube` and `stack cube` are `widowx_stack_cube` among the Bridge tasks). The error is the most similar
-/// task, if one is similar enough.
+/// (`stack`, `stack_cube` and `stack cube` are `widowx_stack_cube` among the Bridge tasks). The error is the most
+/// similar task, if one is similar enough.
 pub fn resolve(asked: &TaskId, offered: &[TaskId]) -> Result<TaskId, Option<TaskId>> {
     if offered.contains(asked) {
         return Ok(asked.clone());
