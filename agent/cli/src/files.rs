@@ -33,7 +33,7 @@ pub fn of_checkout(host: &Host, path: &str) -> Result<PathBuf> {
     let installation = installation(host)?;
     ensure!(
         installation.is_checkout(),
-        "{path}: only a checkout of rever has this file; run the command in one"
+        "{path}: only a checkout of rever has this file; run rever from a checkout"
     );
     Ok(installation.root.join(path))
 }

@@ -5,7 +5,7 @@
 //!
 //! - A rate has Wilson's interval at the effective sample size: the size of a simple random sample whose mean has the
 //!   same variance (Kish's design effect). The variance between starts is the observed one. Each task has its own
-//!   variance, smoothed by one success and one failure (Laplace), so that a task that all of a few episodes solved does
+//!   variance, smoothed by one success and one failure (Laplace), so that a task solved in all of its few episodes does
 //!   not count as certain. With one task and one episode per start this is Wilson's interval of a simple rate.
 //! - A gain has Newcombe's interval for paired proportions (Statistics in Medicine 17, 1998, 2635-2650, method 10). It
 //!   combines the two Wilson intervals and is narrower the more the pairs agree. A continuity correction keeps pairs

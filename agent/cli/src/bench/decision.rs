@@ -97,7 +97,7 @@ pub struct Report {
     pub verifier: String,
 }
 
-/// What is timed.
+/// The parameters of the benchmark.
 pub struct DecisionBench<'a> {
     /// The policy that proposes candidates.
     pub policy: Arc<Vla>,

@@ -1,6 +1,6 @@
 //! Benchmarks of decisions, episodes, the wire and simulators. Decisions are compared with the same weights in PyTorch.
 //!
-//! Alternatives are measured alternately, so that a machine that slows down affects all of them.
+//! The variants in a comparison take alternate measurements, so that a machine that slows down affects all of them.
 
 mod bandwidth;
 mod decision;

@@ -31,9 +31,9 @@ pub struct Row {
     pub native_steps_per_second: f64,
 }
 
-/// What is timed.
+/// The parameters of the benchmark.
 pub struct SimulatorsBench<'a> {
-    /// Where the servers are started; its own simulator does not matter.
+    /// Source of the local servers; its `simulator` is ignored.
     pub servers: &'a ServerSource,
     /// Numbers of sessions.
     pub sessions: &'a [usize],

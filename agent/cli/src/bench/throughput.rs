@@ -45,13 +45,13 @@ pub struct Row {
     pub memory_mb_after: f64,
 }
 
-/// What is timed.
+/// The parameters of the benchmark.
 pub struct ThroughputBench<'a> {
     /// The policy that proposes candidates.
     pub policy: Arc<Vla>,
     /// The verifier that scores them.
     pub verifier: Arc<Verifier>,
-    /// Where the servers are started.
+    /// Source of the local servers.
     pub servers: &'a ServerSource,
     /// Numbers of concurrent episodes.
     pub sessions: &'a [usize],
@@ -89,7 +89,7 @@ impl ThroughputBench<'_> {
         tasks: &[OfferedTask],
         sessions: usize,
     ) -> Result<Row> {
-        let folder = tempfile::tempdir().context("cannot make a folder")?;
+        let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
         let title = format!("{sessions} sessions");
         let run = Run::open(&RunRequest {
             folder: folder.path().to_path_buf(),
@@ -163,7 +163,7 @@ impl ThroughputBench<'_> {
     }
 }
 
-/// What was counted between two times.
+/// The counts of one measurement period.
 struct Window {
     counts: Counts,
     elapsed: Duration,

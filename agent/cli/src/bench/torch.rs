@@ -76,7 +76,7 @@ impl Torch {
         Ok(torch)
     }
 
-    /// Stops or continues the process. PyTorch's idle threads keep spinning, on the cores that ours is timed on.
+    /// Stops or continues the process. PyTorch's idle threads keep spinning and would take cores from rever.
     fn signal(&self, signal: libc::c_int) -> Result<()> {
         let process =
             libc::pid_t::try_from(self.process.id()).context("process id out of range")?;

@@ -63,9 +63,9 @@ pub struct Row {
     pub bare_ms_p50: f64,
 }
 
-/// What is timed.
+/// The parameters of the benchmark.
 pub struct WireBench<'a> {
-    /// Where the server is started.
+    /// Source of the local server.
     pub servers: &'a ServerSource,
     /// Numbers of sessions.
     pub sessions: &'a [usize],

@@ -13,7 +13,7 @@ use super::Program;
 #[command(after_help = "Example:
   rever completions bash > ~/.local/share/bash-completion/completions/rever")]
 pub struct CompletionsArguments {
-    /// Shell to complete commands in
+    /// Shell to generate the script for
     shell: Shell,
 }
 

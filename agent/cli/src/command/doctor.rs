@@ -174,7 +174,7 @@ fn check_policy(folder: &Path, installation: &Installation) -> Result<(Vla, Stri
 fn check_verifier(path: &Path, installation: &Installation, policy: &Vla) -> Result<((), String)> {
     let verifier = Verifier::load(path, policy.parser().digest())?;
     let place = place(path, installation);
-    Ok(((), format!("{place}: digest {}, fits the policy", short(verifier.digest()))))
+    Ok(((), format!("{place}: digest {}, matches the policy", short(verifier.digest()))))
 }
 
 /// The path to print. A temporary installation is deleted when the command ends, so its paths are not printed.

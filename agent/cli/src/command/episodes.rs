@@ -338,7 +338,7 @@ fn task(text: &str) -> Result<TaskId, String> {
 pub fn results(folder: &Path) -> Result<(Results, Value)> {
     let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
     let mut provenance = serde_json::to_value(&header)?;
-    // The version of the header's format says nothing about the result file.
+    // This is the version of the header's format, not of the result file's.
     provenance.as_object_mut().map(|fields| fields.remove("version"));
     let simulator = summaries.first().map(|summary| summary.simulator.as_str());
     provenance["versions"]["simulator"] = json!(simulator);
