@@ -85,8 +85,8 @@ fn no_interval_is_without_width_even_where_all_pairs_agree() {
 
 #[test]
 fn a_single_pair_per_task_decides_nothing_that_half_the_tasks_contradict() {
-    // `rever demo --episodes 1`: the verifier wins on two tasks of four and ties on two. The interval once had no width:
-    // +50.0 [+50.0, +50.0].
+    // `rever demo --episodes 1`: the verifier wins on two tasks of four and ties on two. The interval once had zero
+    // width: +50.0 [+50.0, +50.0].
     let (win, tie) = (pairs([0, 1, 0, 0]), pairs([1, 0, 0, 0]));
     let better = [win.0.clone(), win.0, tie.0.clone(), tie.0];
     let worse = [win.1.clone(), win.1, tie.1.clone(), tie.1];

@@ -152,7 +152,7 @@ fn by_candidates(results: &Results) -> String {
             }));
         }
     }
-    titled("Success by number of candidates N", &["", "N", "at the last step"], rows, "")
+    titled("Success against the number of candidates N", &["", "N", "at the last step"], rows, "")
 }
 
 fn counts(results: &Results) -> String {
