@@ -30,7 +30,7 @@ pub struct SettingHeadroom {
     pub headroom: Headroom,
 }
 
-/// The gains of `verifier` and `verifier-medoid` over all other strategies but the oracle, of `verifier-medoid` over
+/// The gains of `verifier` and `verifier+medoid` over all other strategies but the oracle, of `verifier+medoid` over
 /// `verifier`, and of `first-well-formed` over `sample`: the gain from discarding malformed candidates alone.
 pub fn gains(settings: &[SettingEpisodes<'_>]) -> Vec<SettingGain> {
     let mut gains = Vec::new();
