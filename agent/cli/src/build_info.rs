@@ -1,4 +1,4 @@
-//! Which build of the program this is.
+//! Version, commit and date of this build, and the command line of this process.
 
 use serde_json::{Value, json};
 use store::provenance::Build;
@@ -9,12 +9,12 @@ pub fn build() -> Build {
     Build::new(env!("CARGO_PKG_VERSION"), env!("REVER_COMMIT"), env!("REVER_BUILD_DATE"))
 }
 
-/// How this program was called, word by word.
+/// The command line of this process, one entry per argument.
 pub fn command_line() -> Vec<String> {
     std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect()
 }
 
-/// Everything that results depend on and that is known before a run starts.
+/// The versions that results depend on and that are known before a run starts.
 pub fn versions(policy: &str, verifier: Option<&str>) -> Value {
     json!({
         "rever": env!("CARGO_PKG_VERSION"),
@@ -24,7 +24,7 @@ pub fn versions(policy: &str, verifier: Option<&str>) -> Value {
     })
 }
 
-/// What the records of this build say; simulator, policy and verifier are filled in for each.
+/// The versions for the records of this build. Simulator, policy and verifier are filled in for each episode.
 pub fn record_versions() -> Versions {
     Versions {
         rever: env!("CARGO_PKG_VERSION").to_owned(),

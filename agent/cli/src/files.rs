@@ -1,4 +1,4 @@
-//! The program's own files: those of a checkout, or the ones that `build.rs` embeds in the program.
+//! The program's own files: from a checkout, or embedded in the program by `build.rs`.
 
 use std::path::PathBuf;
 
@@ -10,17 +10,17 @@ const BUNDLE: Bundle = Bundle {
     digest: env!("REVER_FILES_DIGEST"),
 };
 
-/// Finds them; embedded ones are unpacked into the data folder when they are first needed.
+/// Finds the files. Embedded files are unpacked into the data folder on first use.
 pub fn installation(host: &Host) -> Result<Installation> {
     Installation::find(host, &BUNDLE, Missing::Install)
 }
 
-/// Finds them and changes nothing on this machine.
+/// Finds the files without changing anything on this machine.
 pub fn installation_unchanged(host: &Host) -> Result<Installation> {
     Installation::find(host, &BUNDLE, Missing::Report)
 }
 
-/// The named checkpoint, or the one that comes with the program.
+/// The folder of the given checkpoint, or of the one that comes with the program.
 pub fn policy_folder(named: Option<&PathBuf>, host: &Host) -> Result<PathBuf> {
     match named {
         Some(folder) => Ok(folder.clone()),
@@ -28,12 +28,12 @@ pub fn policy_folder(named: Option<&PathBuf>, host: &Host) -> Result<PathBuf> {
     }
 }
 
-/// A file that only a checkout has.
+/// The path of a file that exists only in a checkout.
 pub fn of_checkout(host: &Host, path: &str) -> Result<PathBuf> {
     let installation = installation(host)?;
     ensure!(
         installation.is_checkout(),
-        "{path}: expected to run in a checkout of rever, which has it"
+        "{path}: only a checkout of rever has this file; run rever from a checkout"
     );
     Ok(installation.root.join(path))
 }

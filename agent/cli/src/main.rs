@@ -19,7 +19,7 @@ use runtime::servers::Host;
 
 fn main() -> ExitCode {
     panics::report_panics();
-    // Wrong usage ends inside `parse`, with status 2 and a message that says what was expected.
+    // On wrong usage `parse` prints what was expected and exits with status 2.
     let program = Program::parse();
     #[expect(clippy::disallowed_methods, reason = "this is main")]
     let variable = |name| std::env::var(name).ok().filter(|value| !value.is_empty());
@@ -33,7 +33,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// As a shell sees a command: 2 for wrong usage, 130 for one that was stopped with Ctrl-C, 1 for anything else.
+/// The exit status: 2 for wrong usage, 130 after Ctrl-C, 1 for any other error.
 fn status_of(error: &anyhow::Error) -> u8 {
     if error.is::<command::WrongUsage>() {
         2
@@ -44,7 +44,7 @@ fn status_of(error: &anyhow::Error) -> u8 {
     }
 }
 
-/// All that is read of the surroundings, apart from the arguments.
+/// Everything that the program reads from its process, apart from the arguments.
 fn host() -> Host {
     Host {
         program: std::env::current_exe().ok(),

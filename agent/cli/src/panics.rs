@@ -1,22 +1,22 @@
-//! How a defect of the program is reported: with its place, but without the folders of the machine that built it.
+//! Reports a panic as an internal error, with its source location but without paths of the build machine.
 
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::io::{Write, stderr};
 use std::panic::PanicHookInfo;
 
-/// Replaces the standard report, which names files by their paths on the machine that built the program.
+/// Installs a panic hook. The standard hook prints source paths of the build machine.
 pub fn report_panics() {
     std::panic::set_hook(Box::new(report));
 }
 
 fn report(panic: &PanicHookInfo<'_>) {
     let message = panic.payload_as_str().unwrap_or("no message");
-    // In `rever ... | head`, `head` has seen enough: that ends the program and is no defect to be reported.
+    // In `rever ... | head`, `head` closes the pipe early. That ends the program, but it is not a bug.
     if message.starts_with("failed printing to std") && message.contains("Broken pipe") {
         return;
     }
     let place = panic.location().map(|at| format!(" ({}:{})", name_of(at.file()), at.line()));
-    // A report that cannot be written has no reader.
+    // If standard error is closed, there is nowhere left to report to.
     let _ = writeln!(stderr(), "internal error: {message}{}", place.unwrap_or_default());
     let backtrace = Backtrace::capture();
     if backtrace.status() == BacktraceStatus::Captured {
@@ -24,7 +24,7 @@ fn report(panic: &PanicHookInfo<'_>) {
     }
 }
 
-/// A source file from its crate on.
+/// The path of a source file, starting at its crate.
 fn name_of(file: &str) -> &str {
     // REGISTRY/src/INDEX/CRATE-VERSION/src/...
     match file.split_once("/registry/src/").and_then(|(_, rest)| rest.split_once('/')) {

@@ -1,9 +1,10 @@
-//! Whether a score of 0.7 means success in seven of ten cases: reliability bins, calibration error, Brier score.
+//! Calibration: reliability bins, calibration error, Brier score. A calibrated score of 0.7 means 70 % success.
 //!
-//! The verifier is trained with class weights, so its probabilities are those of balanced classes: where successes are not
-//! half of all samples they are shifted by the odds of the classes. That moves no ranking, but it does show here.
+//! The verifier is trained with class weights, so its probabilities are those of balanced classes. If successes are not
+//! half of all samples, its logits are shifted by the log odds of the classes. This changes no ranking, but it changes
+//! these metrics.
 
-/// Bins of the usual reliability diagram.
+/// The usual number of bins of a reliability diagram.
 pub const BINS: usize = 15;
 
 /// One bar of a reliability diagram: the samples whose probability lies in `low..high` (the last bin includes 1).
@@ -48,7 +49,7 @@ pub fn reliability(probabilities: &[f32], labels: &[bool], bins: usize) -> Vec<R
     counts.into_iter().enumerate().map(bin).collect()
 }
 
-/// The mean gap between predicted and observed rate, each bin weighing as many samples as it holds; `None` without samples.
+/// The mean gap between predicted and observed rate, with bins weighted by their samples; `None` without samples.
 pub fn calibration_error(bins: &[ReliabilityBin]) -> Option<f64> {
     let samples: u64 = bins.iter().map(|bin| bin.samples).sum();
     let gaps =
@@ -56,7 +57,7 @@ pub fn calibration_error(bins: &[ReliabilityBin]) -> Option<f64> {
     (samples > 0).then(|| gaps.sum::<f64>() / samples as f64)
 }
 
-/// The mean squared difference of probability and outcome; `None` without samples.
+/// The mean squared difference between probability and outcome; `None` without samples.
 pub fn brier_score(probabilities: &[f32], labels: &[bool]) -> Option<f64> {
     assert_eq!(probabilities.len(), labels.len(), "one label per probability");
     let squares = probabilities.iter().zip(labels);
@@ -81,7 +82,7 @@ mod tests {
 
     #[test]
     fn calibration_error_weighs_bins_by_their_samples() {
-        // Bin 0: predicted 0.25, seen 0.5; bin 1: predicted 0.75, seen 1. The gap is 0.25 in both.
+        // Bin 0: predicted 0.25, observed 0.5; bin 1: predicted 0.75, observed 1. The gap is 0.25 in both.
         let bins = reliability(&[0.25, 0.25, 0.75, 0.75], &[true, false, true, true], 2);
         assert!((calibration_error(&bins).expect("samples") - 0.25).abs() < 1e-12);
         let bins = reliability(&[0.25, 0.75, 0.75, 0.75], &[true, true, true, true], 2);

@@ -1,4 +1,4 @@
-//! What is compared: gains between settings on the same episodes, and how much of the gap to the oracle each closes.
+//! Comparisons: gains between settings on the same episodes, and the share of the gap to the oracle that each closes.
 
 use decision::{Setting, Strategy};
 
@@ -9,29 +9,29 @@ use crate::estimate::{self, Gain, Headroom};
 pub const DEFAULT_SETTING: Setting =
     Setting { strategy: Strategy::Verifier, candidates: 5, temperature: 1.0 };
 
-/// The gain of one setting over another on the episodes that both have run.
+/// The gain of one setting over another on the episodes that both have in common.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SettingGain {
-    /// The setting in question.
+    /// The setting under test.
     pub better: Setting,
-    /// What it is compared with.
+    /// The setting that it is compared with.
     pub worse: Setting,
-    /// Difference of last-step success.
+    /// Difference in success at the last step.
     pub gain: Gain,
 }
 
-/// How much of the gap between a single sample and the oracle a setting closes, at one temperature and with as many
-/// candidates as the oracle has.
+/// The share of the gap between a single sample and the oracle that a setting closes. All three have the same
+/// temperature; setting and oracle have the same number of candidates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SettingHeadroom {
-    /// The setting in question.
+    /// The setting under test.
     pub setting: Setting,
-    /// On the episodes that all three have run.
+    /// The share, on the episodes that all three have in common.
     pub headroom: Headroom,
 }
 
-/// The verifier against everything that costs less, with agreement against agreement alone; and what a second chance at a
-/// well-formed candidate is worth by itself.
+/// The gains of `verifier` and `verifier+medoid` over all other strategies but the oracle, of `verifier+medoid` over
+/// `verifier`, and of `first-well-formed` over `sample`: the gain from discarding malformed candidates alone.
 pub fn gains(settings: &[SettingEpisodes<'_>]) -> Vec<SettingGain> {
     let mut gains = Vec::new();
     for better in settings {
@@ -62,7 +62,7 @@ fn is_compared(better: Setting, worse: Setting) -> bool {
     }
 }
 
-/// Of every setting that chooses, where a single sample and the oracle ran beside it.
+/// The headroom of every setting that chooses among candidates, if the run has a single sample and the oracle.
 pub fn headroom(settings: &[SettingEpisodes<'_>]) -> Vec<SettingHeadroom> {
     let find = |strategy: Strategy, candidates: u32, temperature: f32| {
         let wanted = Setting { strategy, candidates, temperature };
@@ -82,8 +82,8 @@ pub fn headroom(settings: &[SettingEpisodes<'_>]) -> Vec<SettingHeadroom> {
     settings.iter().filter_map(of_setting).collect()
 }
 
-/// The comparison that a run's headline tells: the verifier with the default number of candidates and temperature, or as
-/// near to them as the run has, over a single sample.
+/// The comparison of a run's headline: the verifier against a single sample, with the number of candidates and the
+/// temperature that are nearest to the defaults.
 pub fn main_gain(gains: &[SettingGain]) -> Option<&SettingGain> {
     let is_main = |gain: &&SettingGain| {
         gain.better.strategy == DEFAULT_SETTING.strategy && gain.worse.strategy == Strategy::Sample

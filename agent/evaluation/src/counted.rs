@@ -1,8 +1,8 @@
-//! Which episodes of a run count, and which of them belong together.
+//! Selects the episodes that count, and groups them into clusters.
 //!
-//! Episodes of one task with the same initial layout share a start. Where nothing is drawn (temperature 0) all episodes of a
-//! start are one and the same, so that only the first counts; where candidates are drawn they are a cluster. An episode in
-//! which the policy never acted is no outcome.
+//! Episodes of one task with the same initial layout share a start. At temperature 0 nothing is sampled: all episodes
+//! of a start are identical, and only the first counts. At other temperatures the episodes of a start are a cluster. An
+//! episode in which the policy never acted has no outcome.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,23 +12,23 @@ use store::run::EpisodeSummary;
 
 use crate::estimate::{Cluster, TaskClusters};
 
-/// Where an episode begins, within its task.
+/// The initial layout of an episode, within its task.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Start {
     /// One of the fixed initial layouts.
     Layout(u32),
-    /// Whatever the environment draws from this seed.
+    /// The layout that the environment draws from this seed.
     Seed(u64),
 }
 
 /// The episodes of one setting on one task.
 #[derive(Default)]
 pub struct TaskEpisodes<'a> {
-    /// By the policy's seed, which is 0 where nothing is drawn.
+    /// Keyed by the policy's seed, which is 0 if nothing is sampled.
     starts: BTreeMap<Start, BTreeMap<u64, &'a EpisodeSummary>>,
-    /// Those that repeat another one.
+    /// Episodes that repeat a counted one.
     repeats: Vec<&'a EpisodeSummary>,
-    /// Those without any action of the policy's.
+    /// Episodes in which the policy never acted.
     never_acted: Vec<&'a EpisodeSummary>,
 }
 
@@ -58,12 +58,12 @@ impl<'a> TaskEpisodes<'a> {
         }
     }
 
-    /// The episodes that are in the rates.
+    /// The episodes that rates are computed over.
     pub fn counted(&self) -> impl Iterator<Item = &'a EpisodeSummary> {
         self.starts.values().flat_map(BTreeMap::values).copied()
     }
 
-    /// Episodes that repeat one that is counted.
+    /// Number of episodes that repeat a counted one.
     pub fn repeats(&self) -> u64 {
         self.repeats.len() as u64
     }
@@ -73,7 +73,7 @@ impl<'a> TaskEpisodes<'a> {
         &self.never_acted
     }
 
-    /// What the episodes of each start came to.
+    /// The outcomes of the episodes, one cluster per start.
     pub fn clusters(&self, read: impl Fn(&Statistics) -> bool) -> TaskClusters {
         let cluster = |draws: &BTreeMap<u64, &EpisodeSummary>| {
             cluster(draws.values().map(|summary| read(&summary.statistics)))
@@ -83,25 +83,26 @@ impl<'a> TaskEpisodes<'a> {
 }
 
 impl<'a> SettingEpisodes<'a> {
-    /// Of a setting without episodes so far.
+    /// A setting without episodes.
     pub fn new(setting: Setting, tasks: usize) -> SettingEpisodes<'a> {
         SettingEpisodes { setting, tasks: (0..tasks).map(|_| TaskEpisodes::default()).collect() }
     }
 
-    /// Adds an episode on the task of that number.
+    /// Adds an episode of the task with this index.
     pub fn insert(&mut self, task: usize, summary: &'a EpisodeSummary) {
         let is_drawn = self.is_drawn();
         self.tasks[task].insert(summary, is_drawn);
     }
 
-    /// Whether episodes of one start differ.
+    /// Whether candidates are sampled, so that episodes of one start differ.
     fn is_drawn(&self) -> bool {
         self.setting.temperature > 0.0
     }
 }
 
-/// The success of several settings on the starts and with the random numbers that all of them have: for each setting, task
-/// by task, the same starts. Where one setting draws nothing, its one episode of a start is paired with all of another's.
+/// The success of several settings on the starts and random numbers that all of them have. The result holds, for each
+/// setting and task, the same starts in the same order. A setting that samples nothing has one episode per start; it is
+/// paired with all episodes of the other settings.
 pub fn in_common<const N: usize>(settings: [&SettingEpisodes<'_>; N]) -> [Vec<TaskClusters>; N] {
     let mut all = [const { Vec::new() }; N];
     let tasks = settings.iter().map(|setting| setting.tasks.len()).min().unwrap_or(0);
@@ -119,7 +120,7 @@ pub fn in_common<const N: usize>(settings: [&SettingEpisodes<'_>; N]) -> [Vec<Ta
     all
 }
 
-/// One cluster per setting; none at all where they have nothing in common.
+/// One cluster per setting; empty if the settings have no episode in common.
 fn at_start(settings: &[&SettingEpisodes<'_>], task: usize, start: &Start) -> Vec<Cluster> {
     let mut common: Option<BTreeSet<u64>> = None;
     for setting in settings {
@@ -158,7 +159,7 @@ fn cluster(outcomes: impl Iterator<Item = bool>) -> Cluster {
     Cluster { mean: successes / episodes, episodes }
 }
 
-/// Whether no decision of an episode had a well-formed candidate: what the robot did was not the policy's doing.
+/// Whether no decision of an episode had a well-formed candidate, so that the policy did not control the robot.
 pub fn never_acted(summary: &EpisodeSummary) -> bool {
     summary.held_steps as usize >= summary.decision_ms.len()
 }

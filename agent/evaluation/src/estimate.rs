@@ -1,27 +1,27 @@
-//! Averages over tasks with 95 % intervals: rates, paired gains, headroom. Nothing here is drawn at random.
+//! Averages over tasks with 95 % intervals: rates, paired gains, headroom. All are deterministic (no bootstrap).
 //!
-//! Every task counts the same in an average, and within a task every start (initial layout) does. Episodes that share a
-//! start are a cluster: they are alike, so that ten of them say less than ten starts would.
+//! All tasks have equal weight in an average, and so have all starts (initial layouts) within a task. Episodes that
+//! share a start are a cluster: they are correlated, so ten of them carry less information than ten starts.
 //!
-//! - A rate's interval is Wilson's at the effective number of episodes: the size of a plain sample whose mean varies as
-//!   much (Kish's design effect). Between starts the variance is the one seen; between tasks each has its own, smoothed by
-//!   one success and one failure (Laplace), so that tasks which few episodes always solved do not pass for certain. With one
-//!   task and one episode per start it is Wilson's interval of a plain rate.
-//! - A gain's interval is Newcombe's for paired proportions (Statistics in Medicine 17, 1998, 2635-2650, method 10): the two
-//!   Wilson intervals put together, narrower the more the pairs agree, with a continuity correction so that pairs which
-//!   all agree do not pass for certain.
-//! - Headroom's interval is Fieller's: every ratio that the gain's interval cannot refute.
+//! - A rate has Wilson's interval at the effective sample size: the size of a simple random sample whose mean has the
+//!   same variance (Kish's design effect). The variance between starts is the observed one. Each task has its own
+//!   variance, smoothed by one success and one failure (Laplace), so that a task solved in all of its few episodes does
+//!   not count as certain. With one task and one episode per start this is Wilson's interval of a simple rate.
+//! - A gain has Newcombe's interval for paired proportions (Statistics in Medicine 17, 1998, 2635-2650, method 10). It
+//!   combines the two Wilson intervals and is narrower the more the pairs agree. A continuity correction keeps pairs
+//!   that all agree from counting as certain.
+//! - Headroom has Fieller's interval: every ratio that the gain's interval does not reject.
 //!
-//! None of them has no width, and simulations in the tests show about 95 % coverage from 4 episodes a task on.
+//! No interval has zero width. Simulations in the tests show about 95 % coverage from 4 episodes per task on.
 
 use crate::statistics::{Interval, wilson};
 
-/// What the episodes of one start came to.
+/// The outcomes of the episodes of one start.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cluster {
-    /// Their share of successes.
+    /// Success rate.
     pub mean: f64,
-    /// How many they are.
+    /// Number of episodes.
     pub episodes: f64,
 }
 
@@ -31,30 +31,30 @@ pub type TaskClusters = Vec<Cluster>;
 /// A rate, averaged over tasks.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rate {
-    /// The average; none while a task has no episode, for the average over the others would be another quantity.
+    /// The average. `None` while a task has no episode, because an average over the others is another quantity.
     pub value: Option<f64>,
     /// Its 95 % interval.
     pub interval: Interval,
     /// Episodes over all tasks.
     pub episodes: u64,
-    /// Different starts over all tasks.
+    /// Distinct starts over all tasks.
     pub starts: u64,
 }
 
 /// A paired difference, averaged over tasks.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gain {
-    /// The rate of the one in question minus the rate of the other.
+    /// The rate of the setting under test minus that of the other.
     pub mean: f64,
     /// Its 95 % interval.
     pub interval: Interval,
-    /// The rate of the one in question, over the pairs.
+    /// The rate of the setting under test, over the pairs.
     pub better_rate: f64,
-    /// The rate of what it is compared with, over the pairs.
+    /// The rate of the setting that it is compared with, over the pairs.
     pub worse_rate: f64,
     /// Pairs of episodes over all tasks.
     pub pairs: u64,
-    /// Different starts among them.
+    /// Distinct starts among them.
     pub starts: u64,
 }
 
@@ -63,9 +63,9 @@ pub struct Gain {
 pub struct Headroom {
     /// 0: no better than a single sample; 1: as good as the oracle.
     pub fraction: f64,
-    /// Its 95 % interval; none where it is not clear that the oracle is better at all, for then it has no ends.
+    /// Its 95 % interval. `None` if it is not clear that the oracle is better: then the interval is unbounded.
     pub interval: Option<Interval>,
-    /// Episodes that all three have run.
+    /// Episodes that all three have in common.
     pub episodes: u64,
 }
 
@@ -83,29 +83,29 @@ impl Rate {
 }
 
 impl Gain {
-    /// Whether the interval leaves only one sign.
+    /// Whether the interval excludes 0.
     pub fn is_clear(&self) -> bool {
         !self.interval.contains(0.0)
     }
 
-    /// About how many pairs would make a gain of this size clear with 80 % power; none where it is clear, or where nothing
-    /// was gained or lost. An interval's width falls with the root of the pairs.
+    /// About how many pairs would make a gain of this size clear with 80 % power. `None` if the gain is clear or zero.
+    /// The width of an interval is inversely proportional to the square root of the number of pairs.
     pub fn pairs_to_tell(&self) -> Option<u64> {
         // Normal quantiles of 97.5 % and 80 %.
         const RATIO: f64 = (1.96 + 0.84) / 1.96;
         let half_width = (self.interval.high - self.interval.low) / 2.0;
         let needed = self.pairs as f64 * (RATIO * half_width / self.mean).powi(2);
         let is_known = !self.is_clear() && needed.is_finite() && needed < PAIRS_TOLD_MAX;
-        // Two digits: the estimate is no better than that.
+        // Two significant digits: the estimate is not more accurate.
         let unit = 10_f64.powf((needed.log10().floor() - 1.0).max(0.0));
         is_known.then(|| ((needed / unit).ceil() * unit) as u64)
     }
 }
 
-/// More pairs than anybody runs.
+/// A larger number of pairs is not reported, because it is impractical.
 const PAIRS_TOLD_MAX: f64 = 1e5;
 
-/// The gain of `better` over `worse`, which hold the same starts; none when a task has none.
+/// The gain of `better` over `worse`, which hold the same starts. `None` if a task has no starts.
 pub fn gain(better: &[TaskClusters], worse: &[TaskClusters]) -> Option<Gain> {
     let (one, other) = (average(better)?, average(worse)?);
     Some(Gain {
@@ -118,7 +118,7 @@ pub fn gain(better: &[TaskClusters], worse: &[TaskClusters]) -> Option<Gain> {
     })
 }
 
-/// The headroom of `chosen`; all three hold the same starts. None when the oracle did no better than a single sample.
+/// The headroom of `chosen`; all three hold the same starts. `None` if the oracle did not beat a single sample.
 pub fn headroom(
     sample: &[TaskClusters],
     chosen: &[TaskClusters],
@@ -174,13 +174,13 @@ fn mean(task: &[Cluster]) -> f64 {
     task.iter().map(|cluster| cluster.mean).sum::<f64>() / task.len() as f64
 }
 
-/// How many episodes of different starts would say as much: between the number of starts and that of episodes.
+/// The number of independent episodes with the same information: between the numbers of starts and of episodes.
 fn effective_episodes(task: &[Cluster]) -> f64 {
     let starts = task.len() as f64;
     let episodes = task.iter().map(|cluster| cluster.episodes).sum::<f64>().max(starts);
     let mean = mean(task);
     let squares = task.iter().map(|cluster| (cluster.mean - mean).powi(2)).sum::<f64>();
-    // Starts that all came to the same tell nothing of how alike the episodes of one are.
+    // If all starts have the same mean, the correlation within a start cannot be estimated.
     if squares <= f64::EPSILON {
         return starts;
     }
@@ -200,13 +200,13 @@ fn difference(one: &[TaskClusters], other: &[TaskClusters]) -> Option<Interval> 
     })
 }
 
-/// How the two averages vary together, from the starts within each task; agreement is lessened by Newcombe's continuity
-/// correction of half an episode.
+/// The correlation of the two averages, from the starts within each task. Newcombe's continuity correction reduces
+/// agreement by half an episode.
 fn correlation(one: &[TaskClusters], other: &[TaskClusters]) -> f64 {
     let starts: f64 = one.iter().map(|task| task.len() as f64).sum();
     let [mut together, mut alone, mut alone_other] = [0.0; 3];
     for (task, other_task) in one.iter().zip(other) {
-        // As much as the task's variance weighs in that of the average.
+        // The weight of the task's variance in that of the average.
         let weight = (starts / one.len() as f64 / task.len() as f64).powi(2);
         let (mean, other_mean) = (mean(task), mean(other_task));
         for (cluster, other_cluster) in task.iter().zip(other_task) {
@@ -226,8 +226,8 @@ fn correlation(one: &[TaskClusters], other: &[TaskClusters]) -> f64 {
     together / scale
 }
 
-/// The interval of `chosen - sample - ratio (oracle - sample)`, up to a positive factor: of a difference of two weighted
-/// means, so that both stay rates whatever the ratio is.
+/// The interval of `chosen - sample - ratio (oracle - sample)`, up to a positive factor. It is written as a difference
+/// of two weighted means, so that both are rates for every ratio.
 fn remainder(
     sample: &[TaskClusters],
     chosen: &[TaskClusters],
@@ -244,7 +244,7 @@ fn remainder(
     }
 }
 
-/// `(1 - share) one + share other`, start by start.
+/// `(1 - share) one + share other` for every start.
 fn mixture(one: &[TaskClusters], other: &[TaskClusters], share: f64) -> Vec<TaskClusters> {
     let mix = |(a, b): (&Cluster, &Cluster)| Cluster {
         mean: (1.0 - share) * a.mean + share * b.mean,
@@ -254,7 +254,7 @@ fn mixture(one: &[TaskClusters], other: &[TaskClusters], share: f64) -> Vec<Task
     tasks.map(|(one, other)| one.iter().zip(other).map(mix).collect()).collect()
 }
 
-/// The last ratio in one direction that is possible, from one that is; none when there is no last one within reach.
+/// The last possible ratio in one direction, starting from a possible one. `None` if no end is found.
 fn last_possible(from: f64, direction: f64, is_possible: impl Fn(f64) -> bool) -> Option<f64> {
     const DOUBLINGS_MAX: i32 = 40;
     const HALVINGS: usize = 60;

@@ -1,4 +1,4 @@
-//! The first sentence of tables and page: what a run shows, with its interval and its number of episodes.
+//! The headline of tables and page: the main result of a run, with its interval and its number of episodes.
 
 use decision::{Setting, Strategy};
 
@@ -7,19 +7,19 @@ use crate::estimate::Rate;
 use crate::results::{Results, SettingResult};
 use crate::statistics::Interval;
 
-/// A statement, the figure that it comes down to, and what to make of it.
+/// A statement, the gain and a verdict on it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Headline {
     /// Before the figure.
     pub statement: String,
-    /// The gain with its sign, where two settings are compared.
+    /// The gain with its sign, if two settings are compared.
     pub gain: Option<String>,
     /// After the figure.
     pub remark: String,
 }
 
 impl Headline {
-    /// The verifier against a single sample; without both, the first setting alone. None without any setting.
+    /// The verifier compared with a single sample. If either is missing, the first setting alone; without any, `None`.
     pub fn new(results: &Results) -> Option<Headline> {
         match results.main_gain() {
             Some(main) => Some(compared(main)),
@@ -27,7 +27,7 @@ impl Headline {
         }
     }
 
-    /// All of it as one text.
+    /// The whole headline as one text.
     pub fn text(&self) -> String {
         let parts = [Some(self.statement.as_str()), self.gain.as_deref(), Some(&self.remark)];
         parts.into_iter().flatten().collect::<Vec<_>>().join(" ")
@@ -40,7 +40,7 @@ fn compared(main: &SettingGain) -> Headline {
         (true, _, _) => "The verifier is better.".to_owned(),
         (_, true, _) => "The verifier is worse.".to_owned(),
         (_, _, Some(pairs)) => format!(
-            "Not clear yet: the interval includes 0. If the gain is of this size, about {pairs} pairs tell (80 % power)."
+            "Not clear yet: the interval includes 0. About {pairs} pairs would show a gain of this size (80 % power)."
         ),
         (_, _, None) => "Not clear yet: the interval includes 0.".to_owned(),
     };
@@ -74,12 +74,12 @@ fn alone(first: &SettingResult) -> Headline {
             100.0 * interval.low,
             100.0 * interval.high,
         ),
-        None => format!("{name} has no episode with an outcome on some of the tasks yet."),
+        None => format!("{name} has no episode with an outcome on at least one task yet."),
     };
     Headline { statement, gain: None, remark: String::new() }
 }
 
-/// The ends of an interval of differences.
+/// The ends of an interval of differences, with their signs.
 fn signed(interval: Interval) -> String {
     format!("{:+.1} to {:+.1}", 100.0 * interval.low, 100.0 * interval.high)
 }

@@ -1,23 +1,23 @@
-//! What is computed from records: suites of episodes before a run, rates, gains and intervals after it.
+//! Evaluation: plans suites of episodes before a run, and computes rates, gains and intervals from its records.
 //!
 //! ```text
 //! Suite ─▶ EpisodePlans ─▶ (runtime) ─▶ records ─▶ Results ─▶ table, result file, report page
 //! ```
 
-// Which episodes.
+// Planning.
 pub mod suite;
 
-// What came of them.
+// Outcomes.
 pub mod comparisons;
 pub mod counted;
 pub mod estimate;
 pub mod results;
 
-// Statistics that know nothing of episodes.
+// Statistics that do not depend on episodes.
 pub mod calibration;
 pub mod statistics;
 
-// How it is shown.
+// Presentation.
 pub mod headline;
 pub mod report;
 pub mod result_file;

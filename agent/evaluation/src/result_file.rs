@@ -1,4 +1,4 @@
-//! The file that `--json` writes: the same figures as the tables, for programs, with what they were made from.
+//! The file that `--json` writes: the figures of the tables for other programs, with their provenance.
 
 use std::path::Path;
 
@@ -10,28 +10,28 @@ use serde_json::Value;
 use crate::comparisons::{SettingGain, SettingHeadroom};
 use crate::results::{Counts, Results, StepTime, TaskResult};
 
-/// The task, and the variant, that stands for the average over all of them, each of which counts the same.
+/// Name of the task, and of the variant, in the rows of the average. Every task has the same weight in it.
 pub const AVERAGE: &str = "average";
 
 /// The whole file. Rates, gains, shares and interval ends are fractions of 1; all intervals are 95 % intervals.
 #[derive(Debug, Serialize)]
 pub struct ResultFile {
-    /// One row per setting and task in its variant, and one per setting for the average.
+    /// One row per setting and task (with variant), and one per setting for the average.
     pub rows: Vec<Row>,
     /// One entry per comparison.
     pub paired: Vec<Paired>,
-    /// One entry per setting that chooses, where a single sample and the oracle ran beside it.
+    /// One entry per setting that chooses among candidates, if the run has a single sample and the oracle.
     pub headroom: Vec<Headroom>,
-    /// Of one decision: its share of its batch's time; none when nothing was decided.
+    /// Time per decision: its share of its batch's time. `None` without decisions.
     pub decision_ms: Option<StepTime>,
-    /// The median number of decisions that were made together.
+    /// Median batch size of decisions.
     pub batch_size: Option<f64>,
-    /// From an action to the next observation.
+    /// Time from an action to the next observation.
     pub step_ms: Option<StepTime>,
-    /// Of that, the simulator's own.
+    /// The simulator's part of it.
     pub simulator_ms: Option<StepTime>,
-    /// What the figures were made from, under the names that the caller gives: the run's name, options and versions, the
-    /// command line, the build's commit, the date.
+    /// Provenance, with the caller's field names: the run's name, options and versions, the command line, the build's
+    /// commit, the date.
     #[serde(flatten)]
     pub made_from: Value,
 }
@@ -43,26 +43,26 @@ pub struct Row {
     pub task: String,
     /// The task's variant, or [`AVERAGE`].
     pub variant: String,
-    /// How candidates were chosen.
+    /// The strategy that chose the candidates.
     pub strategy: String,
     /// Candidates per step.
     pub candidates: u32,
     /// Sampling temperature; 0 is greedy.
     pub temperature: f32,
-    /// Episodes with an outcome: the number that all rates of the row are over.
+    /// Episodes with an outcome: the denominator of all rates of the row.
     pub episodes: u64,
-    /// Different initial layouts among them; episodes that share one are a cluster.
+    /// Distinct initial layouts among them; episodes that share one are a cluster.
     pub starts: u64,
-    /// What the rates do not tell.
+    /// Counts that the rates do not include.
     #[serde(flatten)]
     pub counts: Counts,
-    /// The object was held at some step.
+    /// Rate of episodes in which the object was grasped at some step.
     pub grasp: Option<f64>,
     /// Lower end of the interval of `grasp`.
     pub grasp_low: f64,
     /// Upper end.
     pub grasp_high: f64,
-    /// Success at the last step; of the average none while a task has no episode.
+    /// Success at the last step. The average is `None` while a task has no episode.
     pub success: Option<f64>,
     /// Lower end of the interval of `success`.
     pub success_low: f64,
@@ -74,24 +74,24 @@ pub struct Row {
     pub success_released: Option<f64>,
 }
 
-/// The difference of last-step success, `a` minus `b`, averaged over tasks.
+/// The difference in success at the last step, `a` minus `b`, averaged over tasks.
 #[derive(Debug, Serialize)]
 pub struct Paired {
-    /// The strategy in question.
+    /// The strategy under test.
     pub a: String,
-    /// The one that it is compared with.
+    /// The strategy that it is compared with.
     pub b: String,
-    /// Of `a`.
+    /// Candidates of `a`.
     pub candidates: u32,
-    /// Of `a`; `b` has the same unless it is greedy.
+    /// Temperature of `a`; `b` has the same unless it is greedy.
     pub temperature: f32,
     /// Pairs over all tasks.
     pub episodes: u64,
-    /// Different initial layouts among them.
+    /// Distinct initial layouts among them.
     pub starts: u64,
-    /// The success of `a` over the pairs.
+    /// Success rate of `a` over the pairs.
     pub success_a: f64,
-    /// The success of `b` over the pairs.
+    /// Success rate of `b` over the pairs.
     pub success_b: f64,
     /// The difference.
     pub gain: f64,
@@ -104,27 +104,27 @@ pub struct Paired {
 /// The share of the gap between a single sample and the oracle that a setting closes.
 #[derive(Debug, Serialize)]
 pub struct Headroom {
-    /// The strategy in question.
+    /// The strategy under test.
     pub strategy: String,
-    /// Candidates per step, the same for the oracle.
+    /// Candidates per step, the same as for the oracle.
     pub candidates: u32,
-    /// Sampling temperature of all three.
+    /// Sampling temperature of the strategy, the single sample and the oracle.
     pub temperature: f32,
-    /// Episodes that all three have run.
+    /// Episodes that all three have in common.
     pub episodes: u64,
     /// 1 is as good as the oracle.
     pub fraction: f64,
-    /// Lower end of its interval; none where the oracle may be no better than a single sample.
+    /// Lower end of its interval; `None` if the oracle may be no better than a single sample.
     pub low: Option<f64>,
     /// Upper end.
     pub high: Option<f64>,
 }
 
 impl ResultFile {
-    /// The file's contents. `made_from` is an object such as a run's header with the command line, the build's commit and the
-    /// date added.
+    /// The file's contents. `made_from` is an object such as a run's header with the command line, the build's commit
+    /// and the date added.
     pub fn new(results: &Results, made_from: Value) -> Result<ResultFile> {
-        ensure!(made_from.is_object(), "result file: expected names and values, got {made_from}");
+        ensure!(made_from.is_object(), "result file: expected an object, got {made_from}");
         let mut rows = Vec::new();
         for result in &results.settings {
             for (task, of_task) in results.tasks.iter().zip(&result.tasks) {

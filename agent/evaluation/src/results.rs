@@ -1,4 +1,4 @@
-//! The results of a run: rates of every setting on every task, gains between paired settings, headroom, decision time.
+//! The results of a run: rates of every setting on every task, paired gains, headroom, times.
 
 use std::collections::BTreeSet;
 
@@ -13,26 +13,26 @@ use crate::counted::{SettingEpisodes, TaskEpisodes};
 use crate::estimate::{Rate, TaskClusters};
 use crate::statistics::quantile;
 
-/// Everything that tables and figures show.
+/// Everything that tables and report show.
 #[derive(Debug, Clone)]
 pub struct Results {
     /// Tasks in the order of every table.
     pub tasks: Vec<TaskId>,
-    /// One entry per setting, hottest temperature first.
+    /// One entry per setting, highest temperature first.
     pub settings: Vec<SettingResult>,
-    /// The comparisons that a verifier has to stand.
+    /// Paired comparisons between settings.
     pub gains: Vec<SettingGain>,
-    /// How much of the gap between a single sample and the oracle each setting closes.
+    /// The share of the gap between a single sample and the oracle that each setting closes.
     pub headroom: Vec<SettingHeadroom>,
-    /// Of a single decision: its share of the time of its batch.
+    /// Time per decision: its share of its batch's time.
     pub decision_ms: Option<StepTime>,
-    /// The median number of decisions that were made together.
+    /// Median batch size of decisions.
     pub batch_size: Option<f64>,
-    /// From an action to the next observation, with the server's other sessions before it.
+    /// Time from an action to the next observation, including the wait for the server's other sessions.
     pub step_ms: Option<StepTime>,
-    /// The part of it that the simulator itself took.
+    /// The simulator's part of it.
     pub simulator_ms: Option<StepTime>,
-    /// The names of the episodes that are in the rates.
+    /// Names of the episodes that rates are computed over.
     pub counted: BTreeSet<String>,
 }
 
@@ -41,57 +41,57 @@ pub struct Results {
 pub struct SettingResult {
     /// The setting.
     pub setting: Setting,
-    /// In the order of the tasks; no episodes where the setting did not run.
+    /// In the order of the tasks; without episodes for a task on which the setting did not run.
     pub tasks: Vec<TaskResult>,
-    /// The average over tasks, each of which counts the same, and the counts of all tasks together.
+    /// The average over tasks with equal weight, and the sums of their counts.
     pub all: TaskResult,
 }
 
-/// Rates and counts of one setting, on one task or over all.
+/// Rates and counts of one setting, on one task or over all tasks.
 #[derive(Debug, Clone, Copy)]
 pub struct TaskResult {
-    /// The object was held at some step.
+    /// The object was grasped at some step.
     pub grasped: Rate,
-    /// Success at the last step: SIMPLER's result.
+    /// Success at the last step, as in SIMPLER.
     pub success: Rate,
     /// Success at some step.
     pub ever_success: Rate,
     /// Success at the last step with the object let go.
     pub released_success: Rate,
-    /// What the rates do not tell.
+    /// Counts that the rates do not include.
     pub counts: Counts,
 }
 
-/// What is counted beside the rates.
+/// Counts that the rates do not include.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct Counts {
-    /// Attempts without an outcome, run again or given up. They are in no rate.
+    /// Attempts without an outcome, retried or given up. They count in no rate.
     pub faults: u64,
-    /// Different episodes in which the policy never acted: not one candidate was well formed. They are in no rate.
+    /// Distinct episodes in which the policy never acted: no candidate was well formed. They count in no rate.
     pub never_acted: u64,
-    /// Episodes that repeat another one, for nothing in them is drawn; counted once.
+    /// Episodes that repeat a counted one because nothing in them is sampled.
     pub repeats: u64,
-    /// Candidates of all counted episodes and of those in which the policy never acted.
+    /// Candidates of counted episodes and of those in which the policy never acted.
     pub proposed: u64,
-    /// Those that hold no valid action; never executed.
+    /// Candidates without a valid action, which are never executed.
     pub malformed: u64,
     /// Decisions of the same episodes.
     pub decisions: u64,
-    /// Those without a well-formed candidate: the robot held still.
+    /// Decisions without a well-formed candidate: the robot held still.
     pub held_steps: u64,
 }
 
-/// Milliseconds over all steps of all episodes; there is none without a step.
+/// Milliseconds over all steps of all episodes.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct StepTime {
     /// Median.
     pub p50: f64,
-    /// 95 of 100 are faster.
+    /// 95th percentile.
     pub p95: f64,
 }
 
 impl Results {
-    /// Counts the episodes of a run and the attempts that broke; `order` are the run's tasks, see [`tasks_in_order`].
+    /// The results of a run's episodes and failed attempts. `order` holds the run's tasks, see [`tasks_in_order`].
     pub fn new(
         summaries: &[EpisodeSummary],
         faults: &[FaultRecord],
@@ -105,7 +105,7 @@ impl Results {
         let mut settings: Vec<Setting> = Vec::new();
         for identity in identities() {
             let setting = identity.setting()?;
-            // A setting of which every attempt broke still has its row.
+            // A setting of which every attempt failed still has a row.
             if !settings.contains(&setting) {
                 settings.push(setting);
             }
@@ -142,19 +142,19 @@ impl Results {
         })
     }
 
-    /// The comparison to tell first.
+    /// The comparison of the headline.
     pub fn main_gain(&self) -> Option<&SettingGain> {
         comparisons::main_gain(&self.gains)
     }
 }
 
-/// The tasks that a run was asked for, from its options: the order of its tables.
+/// The tasks in a run's options, in the order of its tables.
 pub fn tasks_in_order(options: &Value) -> Vec<TaskId> {
     let names = options["tasks"].as_array().map_or(&[][..], Vec::as_slice);
     names.iter().filter_map(|name| name.as_str()?.parse().ok()).collect()
 }
 
-/// Each task once: those of `order` first, then any others by name.
+/// The tasks without duplicates: those of `order` first, then any others by name.
 fn in_order(tasks: impl Iterator<Item = TaskId>, order: &[TaskId]) -> Vec<TaskId> {
     let mut tasks: BTreeSet<TaskId> = tasks.collect();
     let mut ordered: Vec<TaskId> = order.iter().filter_map(|task| tasks.take(task)).collect();
@@ -216,7 +216,7 @@ fn count(episodes: &TaskEpisodes<'_>, faults: &[&FaultRecord]) -> Counts {
 }
 
 impl Counts {
-    /// Both together.
+    /// The sums.
     pub fn plus(self, other: Counts) -> Counts {
         Counts {
             faults: self.faults + other.faults,

@@ -1,6 +1,6 @@
-//! Wilson's interval, quantiles, the area under the ROC curve.
+//! Wilson intervals, quantiles, the area under the ROC curve.
 
-/// The two-sided 95 % point of the normal distribution: every interval of this project is a 95 % interval.
+/// The two-sided 95 % quantile of the normal distribution: every interval of this project is a 95 % interval.
 const NORMAL_95: f64 = 1.959_963_984_540_054;
 
 /// A 95 % interval.
@@ -13,18 +13,18 @@ pub struct Interval {
 }
 
 impl Interval {
-    /// Of a rate of which nothing is known.
+    /// The interval of a rate without observations.
     pub const UNKNOWN: Interval = Interval { low: 0.0, high: 1.0 };
 
-    /// Whether a value is compatible with what was seen.
+    /// Whether the interval contains a value.
     pub fn contains(self, value: f64) -> bool {
         (self.low..=self.high).contains(&value)
     }
 }
 
-/// Wilson's 95 % interval for the rate seen in `trials` trials: honest also near 0 and 1 and for few trials.
+/// Wilson's 95 % interval for the rate observed in `trials` trials. It is accurate near 0 and 1 and for few trials.
 ///
-/// Trials need not be a whole number: those of a clustered sample are its effective number.
+/// `trials` need not be a whole number: for a clustered sample it is the effective sample size.
 pub fn wilson(rate: f64, trials: f64) -> Interval {
     assert!((0.0..=1.0).contains(&rate), "a rate is in 0..=1, got {rate}");
     if trials <= 0.0 {
@@ -40,7 +40,7 @@ pub fn wilson(rate: f64, trials: f64) -> Interval {
     Interval { low, high }
 }
 
-/// The quantile of sorted values, linear between neighbours; NaN without values.
+/// The quantile of sorted values, interpolated linearly; NaN without values.
 pub fn quantile(sorted: &[f64], share: f64) -> f64 {
     assert!((0.0..=1.0).contains(&share), "a quantile's share is in 0..=1, got {share}");
     let place = share * sorted.len().saturating_sub(1) as f64;
@@ -49,9 +49,9 @@ pub fn quantile(sorted: &[f64], share: f64) -> f64 {
     below + (above - below) * place.fract()
 }
 
-/// Area under the ROC curve: the chance that a positive scores above a negative, ties counting half.
+/// Area under the ROC curve: the probability that a positive scores above a negative, with ties counted as half.
 ///
-/// `None` when one class is missing. Ties share the mean of their ranks.
+/// `None` if a class is missing. Ties share the mean of their ranks.
 pub fn auroc(scores: &[f32], labels: &[bool]) -> Option<f64> {
     assert_eq!(scores.len(), labels.len(), "one label per score");
     let positives = labels.iter().filter(|label| **label).count() as f64;
@@ -94,7 +94,7 @@ mod tests {
         check_wilson(15, 148, 0.0624, 0.1605);
         check_wilson(0, 20, 0.0, 0.1611);
         check_wilson(1, 29, 0.0061, 0.1718);
-        // The mirror image of none in twenty.
+        // Symmetric to 0 of 20.
         check_wilson(20, 20, 1.0 - 0.1611, 1.0);
         assert_eq!(wilson(0.0, 0.0), Interval::UNKNOWN);
     }

@@ -1,8 +1,8 @@
-//! Suites: which episodes an evaluation consists of.
+//! Suites: the episodes that an evaluation consists of.
 //!
-//! Seeds come from what an episode is, never from which worker runs it or when, so that a resumed, a distributed and an
-//! uninterrupted run have the same episodes. The policy's seed does not depend on the strategy: all settings of one episode
-//! start from the same initial layout with the same random numbers, which is what makes their differences paired.
+//! Seeds are derived from an episode's identity, never from the worker that runs it or the time. So a resumed, a
+//! distributed and an uninterrupted run have the same episodes. The policy's seed does not depend on the strategy: all
+//! settings of one episode have the same initial layout and the same random numbers, which pairs their outcomes.
 
 use anyhow::Context;
 use clap::ValueEnum;
@@ -11,34 +11,34 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use store::plan::{EpisodePlan, OfferedTask, SEEDS_PER_RANGE, SeedRange};
 
-/// Where the objects of each episode start.
+/// The initial layouts of the episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Layouts {
-    /// The task's fixed layouts, over and over.
+    /// The task's fixed layouts in order, repeated as often as needed.
     Grid,
     /// Drawn from each episode's seed.
     Random,
 }
 
-/// Which episodes to run.
+/// The episodes to run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Suite {
     /// Tasks, each in a variant.
     pub tasks: Vec<OfferedTask>,
-    /// Episodes of each task.
+    /// Episodes per task.
     pub episodes: u32,
-    /// Where objects start.
+    /// Fixed or random initial layouts.
     pub layouts: Layouts,
-    /// Where seeds come from.
+    /// The range that seeds are drawn from.
     pub range: SeedRange,
-    /// Another number gives other layouts and other samples.
+    /// Determines the random layouts and the samples.
     pub seed: u64,
 }
 
 impl Suite {
-    /// The episodes, task by task within each number, so that a partial run covers all tasks alike. An error when a task
-    /// has no fixed layouts and is to be run on them.
+    /// The episodes. Tasks alternate, so that a partial run covers all tasks equally. An error if a task has no fixed
+    /// layouts and is to be run on them.
     pub fn episodes(&self) -> anyhow::Result<Vec<EpisodePlan>> {
         let numbers = 0..self.episodes;
         numbers
@@ -52,7 +52,7 @@ impl Suite {
             Layouts::Random => None,
             Layouts::Grid => Some(episode.checked_rem(*layouts).with_context(|| {
                 format!(
-                    "layouts: expected random ones for {task}, which has no fixed ones, got grid"
+                    "layouts: expected random ones for {task}, which has no fixed layouts, got grid"
                 )
             })?),
         };
@@ -62,13 +62,13 @@ impl Suite {
             layout,
             episode,
             seed: self.range.first() + place % SEEDS_PER_RANGE,
-            // Every reader of a record, JavaScript included, must hold this number exactly.
+            // Every reader of a record, including JavaScript, must represent this number exactly.
             sampling_seed: mixed("sample", task, episode, self.seed) % (1 << 53),
         })
     }
 }
 
-/// A number that is the same on every machine and in every version of this program.
+/// A hash that is the same on every machine and in every version of this program.
 fn mixed(purpose: &str, id: &TaskId, episode: u32, seed: u64) -> u64 {
     let TaskId { task, variant } = id;
     let digest = Sha256::digest(format!("{purpose}/{task}/{variant}/{episode}/{seed}"));
@@ -130,7 +130,7 @@ mod tests {
     }
 
     /// Computed independently: the first eight bytes, little endian, of
-    /// `sha256("place/widowx_spoon_on_towel/default/0/0")` and of the same with `sample`.
+    /// `sha256("place/widowx_spoon_on_towel/default/0/0")` and of the same with `sample` instead of `place`.
     const SEEDS_OF_THE_FIRST_EPISODE: (u64, u64) = (3_977_631_995, 8_353_930_603_780_422);
 
     #[test]
@@ -151,7 +151,7 @@ mod tests {
         let mut suite = suite(Layouts::Grid, 0);
         suite.tasks[2].layouts = 0;
         let error = suite.episodes().expect_err("no grid").to_string();
-        let expected = "layouts: expected random ones for widowx_stack_cube, which has no fixed ones, got grid";
+        let expected = "layouts: expected random ones for widowx_stack_cube, which has no fixed layouts, got grid";
         assert_eq!(error, expected);
         suite.layouts = Layouts::Random;
         assert_eq!(plans(&suite).len(), 120);

@@ -1,4 +1,4 @@
-//! What a terminal shows of a run: the answer first, then the rates and gains behind it. Everything else is in [`details`].
+//! The results of a run in a terminal: the answer first, then its rates and gains. Everything else is in [`details`].
 
 pub mod details;
 
@@ -12,10 +12,10 @@ use crate::results::{Counts, Results, SettingResult};
 use crate::statistics::Interval;
 use crate::task_names::short_names;
 
-/// Columns of a terminal that tells no other number, and at most.
+/// Default width of a terminal in columns.
 pub const COLUMNS_DEFAULT: usize = 80;
 
-/// The answer: at most `columns` wide where that is possible at all.
+/// The answer, at most `columns` wide if possible.
 pub fn answer(results: &Results, columns: usize) -> String {
     let headline =
         Headline::new(results).map_or_else(String::new, |one| wrapped(&one.text(), columns));
@@ -24,7 +24,7 @@ pub fn answer(results: &Results, columns: usize) -> String {
     parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
 }
 
-/// Success of every setting, on all tasks together and on each.
+/// Success of every setting, over all tasks and on each task.
 fn rates(results: &Results, columns: usize) -> String {
     let names = short_names(&results.tasks);
     let episodes = common(results.settings.iter().map(|one| episodes(one.all.success)));
@@ -50,7 +50,7 @@ fn rates(results: &Results, columns: usize) -> String {
     format!("Success at the last step in %, 95 % intervals{each}\n{}", aligned(&rows))
 }
 
-/// Paired gains, with the verdict for which they are made.
+/// Paired gains, each with a verdict.
 fn gains(results: &Results, columns: usize) -> String {
     if results.gains.is_empty() {
         return String::new();
@@ -71,7 +71,7 @@ fn gains(results: &Results, columns: usize) -> String {
     let head = ["", "gain [95 % interval]", "pairs", ""].map(str::to_owned).to_vec();
     let mut rows: Vec<Vec<String>> =
         std::iter::once(head).chain(results.gains.iter().map(row)).collect();
-    // The verdict can be read off the interval; the number of pairs is that of episodes.
+    // In a narrow terminal the verdict and the pairs are dropped: the intervals and the rates imply them.
     for _ in 0..2 {
         if is_wider(&rows, columns) {
             rows.iter_mut().for_each(|row| drop(row.pop()));
@@ -86,7 +86,7 @@ fn is_wider(rows: &[Vec<String>], columns: usize) -> bool {
     aligned(rows).lines().any(|line| line.trim_end().chars().count() > columns)
 }
 
-/// A setting beside another, without what both share.
+/// A setting without the values that it shares with another.
 fn within(setting: Setting, beside: Setting) -> String {
     let Setting { strategy, candidates, temperature } = setting;
     let mut text = strategy.to_string();
@@ -100,19 +100,17 @@ fn within(setting: Setting, beside: Setting) -> String {
     text
 }
 
-/// What must be known beside the rates: only what there is.
+/// Remarks on faults, held episodes and malformed candidates, if there are any, and on the names of settings.
 fn remarks(results: &Results, columns: usize) -> String {
     let Counts { faults, never_acted, proposed, malformed, decisions, held_steps, .. } =
         results.settings.iter().map(|one| one.all.counts).fold(Counts::default(), Counts::plus);
     let mut lines = Vec::new();
     if faults > 0 {
-        lines.push(format!(
-            "Faults: {faults} attempts broke and were retried; they are in no rate."
-        ));
+        lines.push(format!("Faults: {faults} attempts failed and do not count in any rate."));
     }
     if never_acted > 0 {
         lines.push(format!(
-            "In {never_acted} episodes every decision was held (no well-formed candidate): no outcome."
+            "{never_acted} episodes without any well-formed candidate have no outcome: the robot held still."
         ));
     }
     if malformed > 0 {
@@ -129,14 +127,14 @@ fn remarks(results: &Results, columns: usize) -> String {
     lines.iter().map(|line| wrapped(line, columns)).collect()
 }
 
-/// What all say, if they say the same.
+/// The common text, if all texts are equal.
 fn common(texts: impl Iterator<Item = String>) -> Option<String> {
     let mut texts: Vec<String> = texts.collect();
     texts.dedup();
     (texts.len() == 1).then(|| texts.remove(0))
 }
 
-/// Lines of at most so many columns, broken between words.
+/// Wraps text between words to lines of at most this many columns.
 pub fn wrapped(text: &str, columns: usize) -> String {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
@@ -151,7 +149,7 @@ pub fn wrapped(text: &str, columns: usize) -> String {
     lines.iter().map(|line| format!("{line}\n")).collect()
 }
 
-/// How many episodes a rate is over, and over how many initial layouts where these are fewer.
+/// Number of episodes of a rate, and of initial layouts if there are fewer.
 fn episodes(rate: Rate) -> String {
     match rate.episodes == rate.starts {
         true => rate.episodes.to_string(),

@@ -1,9 +1,9 @@
-//! Short names of tasks: what tables show and what a command line may say for a long name.
+//! Short names of tasks, for tables and for the command line.
 
 use decision::{TaskId, VARIANT_DEFAULT};
 
-/// The names of tasks in tables: the longest word that no other task's name has, with the variant where it is not the
-/// default one. The whole name where a task has no such word, or where there is only one task.
+/// The names of tasks in tables: the longest word that no other task's name contains, and the variant unless it is the
+/// default. A task without such a word, or the only task, has its full name.
 pub fn short_names(tasks: &[TaskId]) -> Vec<String> {
     let mut names: Vec<&str> = tasks.iter().map(|id| id.task.as_str()).collect();
     names.dedup();
@@ -22,9 +22,9 @@ pub fn short_names(tasks: &[TaskId]) -> Vec<String> {
     tasks.iter().map(short).collect()
 }
 
-/// The offered task that a name stands for: its whole name, or words of it in their order which only one task has
-/// (`stack`, `stack_cube` and `stack cube` are `widowx_stack_cube` among the Bridge tasks). The error names a task that the
-/// name resembles, if there is one.
+/// The offered task with this name: its full name, or consecutive words of it that no other task's name contains
+/// (`stack`, `stack_cube` and `stack cube` are `widowx_stack_cube` among the Bridge tasks). The error is the most
+/// similar task, if one is similar enough.
 pub fn resolve(asked: &TaskId, offered: &[TaskId]) -> Result<TaskId, Option<TaskId>> {
     if offered.contains(asked) {
         return Ok(asked.clone());
@@ -51,7 +51,7 @@ fn nearest(asked: &TaskId, offered: &[TaskId]) -> Option<TaskId> {
     (likeness(best) > LIKENESS_MIN).then(|| best.clone())
 }
 
-/// Of names that are likely to be misspelt forms of each other (Jaro-Winkler, 0 to 1).
+/// Similarity above which one name is likely a misspelling of another (Jaro-Winkler, 0 to 1).
 const LIKENESS_MIN: f64 = 0.8;
 
 fn words(name: &str) -> impl DoubleEndedIterator<Item = &str> {

@@ -1,16 +1,16 @@
-//! How fast this machine reads as many bytes as a step's weights: from memory, or from a cache that holds them.
+//! Measures how fast this machine reads a buffer as large as a step's weights, from memory or from cache.
 
 use std::hint::black_box;
 use std::time::Instant;
 
 use rayon::prelude::*;
 
-/// Passes of which the fastest counts.
+/// Number of passes; the fastest counts.
 const PASSES: usize = 40;
-/// Sums side by side: enough that additions do not wait for each other.
+/// Independent partial sums, so that additions do not wait for each other.
 const SUMS: usize = 64;
 
-/// Bytes per second over all threads, the fastest of several passes over a buffer of `bytes`.
+/// Bytes per second over all threads: the fastest of several passes over a buffer of `bytes`.
 pub fn measure(bytes: usize) -> f64 {
     let values = vec![1.0_f32; (bytes / size_of::<f32>()).max(SUMS)];
     let share = values.len().div_ceil(rayon::current_num_threads());

@@ -1,4 +1,4 @@
-//! One decision at a time: prefill, decode, parse, score, choose.
+//! Times single decisions: prefill, decode, parse, score, choose.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -19,75 +19,75 @@ use super::torch::{Hello, Torch};
 
 /// Numbers of candidates that are timed.
 const CANDIDATES: [usize; 5] = [1, 2, 5, 8, 16];
-/// The number that ratios are of: the default of every command.
+/// The number of candidates that ratios refer to: the default of every command.
 const CANDIDATES_DEFAULT: usize = 5;
-/// Rounds before any is counted: caches fill, compilers compile.
+/// Rounds that are not counted, while caches fill and compilers compile.
 const WARM_UP_ROUNDS: usize = 1;
 
-/// How candidates come about.
+/// How candidates are sampled.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Setting {
     /// Candidates per decision.
     pub candidates: usize,
-    /// 0 for the greedy one, else 1.
+    /// 0 for greedy decoding, else 1.
     pub temperature: f32,
 }
 
-/// What the decisions of one setting cost.
+/// The results for one setting.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
-    /// Of what.
+    /// The setting.
     #[serde(flatten)]
     pub setting: Setting,
-    /// Image and prompt.
+    /// Time of prefill (image and prompt): the fastest observation.
     pub prefill_ms: f64,
-    /// One token of every candidate, none of them shared.
+    /// Time of a decoding step, one token of every candidate: the fastest observation.
     pub step_ms: f64,
-    /// Of all candidates of a decision, mean.
+    /// Tokens of all candidates of a decision, mean.
     pub tokens: f64,
-    /// Prefill, decode, parse, score, choose.
+    /// Time of a decision (prefill, decode, parse, score, choose), median.
     pub decision_ms_p50: f64,
-    /// The slow ones.
+    /// The same, 95th percentile.
     pub decision_ms_p95: f64,
-    /// Tokens of all candidates over the whole decision's time.
+    /// Tokens of all candidates divided by the time of the whole decision.
     pub tokens_per_second: f64,
     /// Bytes of weights that a step reads.
     pub weight_bytes: usize,
-    /// Of the bandwidth at which this machine's processors read as many bytes.
+    /// Bandwidth of a step, as a share of that at which this machine reads a buffer of the same size.
     pub bandwidth_share: f64,
 }
 
 /// The same decisions in PyTorch, without parsing, scoring and choosing.
 #[derive(Debug, Clone, Serialize)]
 pub struct Comparison {
-    /// Eager, compiled, ….
+    /// How PyTorch runs the network: eager, compiled, ….
     pub setting: String,
-    /// Per decision.
+    /// Candidates per decision.
     pub candidates: usize,
-    /// Prefill and decode.
+    /// Time of prefill and decode, median.
     pub decision_ms_p50: f64,
-    /// The slow ones.
+    /// The same, 95th percentile.
     pub decision_ms_p95: f64,
 }
 
-/// All of one run.
+/// The results of one benchmark.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
-    /// Ours; the first is the greedy one.
+    /// The results of rever, one row per setting; the first is greedy.
     pub rows: Vec<Row>,
-    /// Reading as many bytes as a step's weights, over all threads.
+    /// Bandwidth at which all threads read a buffer as large as a step's weights.
     pub bandwidth_bytes_per_second: f64,
-    /// Five verified candidates over one greedy candidate, by medians.
+    /// Median time of five verified candidates divided by that of one greedy candidate.
     pub ratio_greedy: f64,
-    /// PyTorch eager over ours at five candidates; only with a comparison.
+    /// Time of eager PyTorch divided by that of rever, at five candidates; only with a comparison.
     pub ratio_eager: Option<f64>,
-    /// The best PyTorch setting over ours at five candidates.
+    /// The same for the fastest PyTorch setting.
     pub ratio_best: Option<f64>,
-    /// PyTorch's times.
+    /// The results of PyTorch.
     pub torch: Vec<Comparison>,
-    /// Which PyTorch.
+    /// PyTorch's version and settings.
     pub torch_hello: Option<Hello>,
-    /// Threads of ours.
+    /// Threads of rever.
     pub threads: usize,
     /// Decisions behind every median.
     pub decisions: usize,
@@ -97,22 +97,22 @@ pub struct Report {
     pub verifier: String,
 }
 
-/// What is timed.
+/// The parameters of the benchmark.
 pub struct DecisionBench<'a> {
-    /// Proposes.
+    /// The policy that proposes candidates.
     pub policy: Arc<Vla>,
-    /// Scores.
+    /// The verifier that scores them.
     pub verifier: Arc<Verifier>,
-    /// Decisions are made on these in turn.
+    /// The observations to decide on, one after the other.
     pub observations: &'a [Observation],
-    /// Passes over all observations that are counted.
+    /// Counted passes over all observations.
     pub rounds: usize,
     /// Drives the decider; the policy computes in the calling thread.
     pub runtime: &'a tokio::runtime::Runtime,
 }
 
 impl DecisionBench<'_> {
-    /// Measures every setting and PyTorch's, alternately.
+    /// Measures every setting of rever and of PyTorch, alternately.
     pub fn run(&self, mut torch: Option<Torch>, mut progress: impl FnMut(usize)) -> Result<Report> {
         ensure!(self.rounds > 0, "rounds: expected at least 1, got 0");
         let settings = settings();
@@ -160,7 +160,7 @@ impl DecisionBench<'_> {
         self.report(&settings, ours, comparisons.collect(), hello)
     }
 
-    /// Milliseconds of one verified decision, and every candidate's tokens.
+    /// The milliseconds of one decision, and the tokens of every candidate.
     fn decide(
         &self,
         decider: &Decider,
@@ -168,7 +168,7 @@ impl DecisionBench<'_> {
         setting: Setting,
         seed: u64,
     ) -> Result<(f64, Vec<Vec<u32>>)> {
-        // Greedy decoding asks no verifier.
+        // Greedy decoding does not use the verifier.
         let scorer = Arc::clone(&self.verifier) as Arc<dyn Scorer>;
         let (strategy, scorer) = match setting.temperature {
             0.0 => (Strategy::Greedy, None),
@@ -269,7 +269,7 @@ impl Samples {
     }
 }
 
-/// Greedy first, then the sampled ones.
+/// The greedy setting first, then the sampled ones.
 fn settings() -> Vec<Setting> {
     let greedy = Setting { candidates: 1, temperature: 0.0 };
     std::iter::once(greedy).chain(CANDIDATES.map(sampled)).collect()
@@ -311,7 +311,7 @@ mod tests {
         assert_eq!(report.decisions, 2);
         for row in &report.rows {
             assert!(0.0 < row.decision_ms_p50 && row.decision_ms_p50 <= row.decision_ms_p95);
-            // 17 tokens of reasoning and 7 of action; a malformed candidate may have fewer or more.
+            // A candidate has 17 tokens of reasoning and 7 of action. A malformed one may have fewer or more.
             let each = row.tokens / row.setting.candidates as f64;
             assert!((18.0..=30.0).contains(&each), "{row:?}");
         }

@@ -1,6 +1,6 @@
-//! What decisions and episodes cost on this machine, beside the same weights in PyTorch.
+//! Benchmarks of decisions, episodes, the wire and simulators. Decisions are compared with the same weights in PyTorch.
 //!
-//! The sides of a table are measured alternately: a machine that slows down slows all of them down.
+//! The variants in a comparison take alternate measurements, so that a machine that slows down affects all of them.
 
 mod bandwidth;
 mod decision;

@@ -1,4 +1,4 @@
-//! Observations as they were recorded: what the policy is timed on.
+//! Reads the recorded observations that the policy is timed on.
 
 use std::path::Path;
 

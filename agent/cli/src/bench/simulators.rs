@@ -1,4 +1,4 @@
-//! Our simulators side by side: control steps per second over the wire, with an image and without.
+//! Compares the Python and the native simulator: control steps per second over the wire, with and without an image.
 
 use std::time::Duration;
 
@@ -11,40 +11,40 @@ use evaluation::statistics::quantile;
 use runtime::servers::{LocalServers, LocalSource, Missing, ServerSource, Simulator};
 use runtime::wire::{Environment, Episode, Network};
 
-/// Local servers are on the network already.
+/// How long to wait for the local servers to be found. They have joined the network already.
 const SERVERS_WAIT: Duration = Duration::from_secs(30);
-/// Nothing is rendered for an image of no pixels.
+/// The image size at which nothing is rendered.
 const SIDE_NONE: u32 = 0;
 
-/// One number of sessions, all of them asking one server at once.
+/// The results for one image size and one number of concurrent sessions.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
     /// Height and width of the image; 0 without one.
     pub side: u32,
     /// Sessions of each server.
     pub sessions: usize,
-    /// Of each server, counted.
+    /// Counted steps of each server.
     pub steps: usize,
-    /// Control steps per second of the Python server: the median round.
+    /// Control steps per second of the Python server, from its median step time.
     pub python_steps_per_second: f64,
-    /// And of the native one.
+    /// Control steps per second of the native server, from its median step time.
     pub native_steps_per_second: f64,
 }
 
-/// What is timed.
+/// The parameters of the benchmark.
 pub struct SimulatorsBench<'a> {
-    /// Where the servers are started; its own simulator does not matter.
+    /// Source of the local servers; its `simulator` is ignored.
     pub servers: &'a ServerSource,
     /// Numbers of sessions.
     pub sessions: &'a [usize],
     /// Control steps of every session.
     pub steps: usize,
-    /// Of the image, in pixels.
+    /// Height and width of the image in pixels.
     pub side: u32,
 }
 
 impl SimulatorsBench<'_> {
-    /// Starts one server of each simulator and lets them take turns, step by step.
+    /// Starts one server of each simulator and measures them alternately, step by step.
     pub fn run(&self) -> Result<Vec<Row>> {
         ensure!(self.steps > 0, "steps: expected at least 1, got 0");
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
@@ -59,7 +59,7 @@ impl SimulatorsBench<'_> {
             servers.push(self.servers.start(program?, &network, most)?);
         }
         let rows = runtime.block_on(self.rows(&network, &servers, most));
-        // Servers first: they would report the network's end as an error.
+        // Servers are stopped first. They would report a closed network as an error.
         drop(servers);
         runtime.block_on(network.close())?;
         rows

@@ -1,4 +1,4 @@
-//! Whole episodes, many at once: policy, verifier, wire and simulators together.
+//! Times concurrent episodes: policy, verifier, wire and simulators together.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -24,45 +24,45 @@ use vla::Vla;
 
 use crate::build_info;
 
-/// Control steps of every session before any is counted.
+/// Control steps per session before counting starts.
 const WARM_UP_STEPS: u64 = 10;
-/// The shortest episode: so many decisions need at most as many episodes as this says.
+/// Length of the shortest episode, for an upper bound on the episodes that a number of decisions needs.
 const HORIZON_MIN: u64 = 60;
-/// One number of sessions.
+/// The results for one number of concurrent episodes.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
-    /// Episodes at once.
+    /// Concurrent episodes.
     pub sessions: usize,
-    /// Counted.
+    /// Counted decisions.
     pub decisions: u64,
-    /// Every one of them a control step with its image.
+    /// Counted decisions per second. Each includes a control step with its image.
     pub decisions_per_second: f64,
-    /// Finished, recorded and published.
+    /// Episodes per second that were finished, recorded and published.
     pub episodes_per_second: f64,
-    /// Resident memory of this process when counting began, in MB.
+    /// Resident memory of this process when counting started, in MB.
     pub memory_mb_before: f64,
-    /// And when it ended.
+    /// Resident memory of this process when counting ended, in MB.
     pub memory_mb_after: f64,
 }
 
-/// What is timed.
+/// The parameters of the benchmark.
 pub struct ThroughputBench<'a> {
-    /// Proposes.
+    /// The policy that proposes candidates.
     pub policy: Arc<Vla>,
-    /// Scores.
+    /// The verifier that scores them.
     pub verifier: Arc<Verifier>,
-    /// Where the servers are started.
+    /// Source of the local servers.
     pub servers: &'a ServerSource,
-    /// Numbers of episodes at once.
+    /// Numbers of concurrent episodes.
     pub sessions: &'a [usize],
-    /// Counted for each of them.
+    /// Decisions to count for each of these numbers.
     pub decisions: u64,
-    /// Per decision.
+    /// Candidates per decision.
     pub candidates: u32,
 }
 
 impl ThroughputBench<'_> {
-    /// Runs episodes on random layouts of the tuning range; their outcomes are thrown away.
+    /// Runs episodes on random layouts of the tuning range. Their records are deleted.
     pub fn run(&self) -> Result<Vec<Row>> {
         ensure!(self.decisions > 0, "decisions: expected at least 1, got 0");
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
@@ -89,7 +89,7 @@ impl ThroughputBench<'_> {
         tasks: &[OfferedTask],
         sessions: usize,
     ) -> Result<Row> {
-        let folder = tempfile::tempdir().context("cannot make a folder")?;
+        let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
         let title = format!("{sessions} sessions");
         let run = Run::open(&RunRequest {
             folder: folder.path().to_path_buf(),
@@ -128,7 +128,7 @@ impl ThroughputBench<'_> {
         tokio::pin!(watched);
         let window = tokio::select! {
             window = &mut watched => window?,
-            // The last of its steps may be seen after the last episode has ended.
+            // The last steps may be observed only after the last episode has ended.
             result = rollout.run() => { result?; watched.await? }
         };
         let secs = window.elapsed.as_secs_f64();
@@ -142,7 +142,7 @@ impl ThroughputBench<'_> {
         })
     }
 
-    /// Episodes enough that no session is idle before so many decisions are made.
+    /// A queue with enough episodes that no session is idle before this many decisions are made.
     fn queue(
         &self,
         run: &str,
@@ -163,7 +163,7 @@ impl ThroughputBench<'_> {
     }
 }
 
-/// What happened between two moments.
+/// The counts of one measurement period.
 struct Window {
     counts: Counts,
     elapsed: Duration,
@@ -171,7 +171,7 @@ struct Window {
     memory_mb_after: f64,
 }
 
-/// Waits until `warm_up` steps are done, then for `decisions` more.
+/// Waits until `warm_up` steps are done, then counts `decisions` more.
 async fn watch_window(
     mut counts: watch::Receiver<Counts>,
     warm_up: u64,
@@ -193,13 +193,13 @@ async fn watch_window(
     })
 }
 
-/// Resident memory of this process.
+/// Resident memory of this process, in MB.
 fn resident_mb() -> Result<f64> {
     let status = std::fs::read_to_string("/proc/self/status").context("cannot read /proc")?;
     let kilobytes = status
         .lines()
         .find_map(|line| line.strip_prefix("VmRSS:"))
         .and_then(|rest| rest.split_whitespace().next()?.parse::<f64>().ok())
-        .context("/proc/self/status: expected a line VmRSS")?;
+        .context("/proc/self/status: expected a VmRSS line")?;
     Ok(kilobytes / 1e3)
 }

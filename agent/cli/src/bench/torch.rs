@@ -1,4 +1,4 @@
-//! The other side of the comparison: a Python process that makes the same decisions with PyTorch.
+//! The PyTorch baseline: a Python process that makes the same decisions.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
@@ -13,21 +13,21 @@ pub struct Torch {
     process: Child,
     requests: ChildStdin,
     replies: BufReader<ChildStdout>,
-    /// What it said at its start.
+    /// What the process reported at its start.
     pub hello: Hello,
 }
 
-/// What it is and what it can be asked for.
+/// PyTorch's version and the settings that it supports.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Hello {
-    /// Of PyTorch.
+    /// Version of PyTorch.
     pub version: String,
-    /// Of its thread pool.
+    /// Threads of PyTorch's pool.
     pub threads: usize,
     /// Ways to run the network; the first is eager.
     pub settings: Vec<String>,
-    /// Settings that do not work here, and why.
+    /// Settings that do not work on this machine, and why.
     pub broken: Vec<String>,
 }
 
@@ -35,7 +35,7 @@ pub struct Hello {
 struct Request<'a> {
     setting: &'a str,
     observation: usize,
-    /// (candidates, tokens): each candidate's, so that both sides do the same steps.
+    /// (candidates, tokens): the tokens of each candidate, so that both sides do the same steps.
     tokens: &'a [Vec<u32>],
 }
 
@@ -60,12 +60,12 @@ impl Torch {
             .stdout(Stdio::piped())
             .spawn()
             .with_context(|| format!("cannot start {}", python.display()))?;
-        let requests = process.stdin.take().context("no way to write to PyTorch's process")?;
-        let replies = process.stdout.take().context("no way to read from PyTorch's process")?;
+        let requests = process.stdin.take().context("cannot write to the PyTorch process")?;
+        let replies = process.stdout.take().context("cannot read from the PyTorch process")?;
         let mut replies = BufReader::new(replies);
         let hello: Hello = read(&mut replies).with_context(|| {
             format!(
-                "{} does not run {} (it needs torch, safetensors, tokenizers; --python names another Python)",
+                "{} does not run {} (it needs torch, safetensors and tokenizers; choose another Python with --python)",
                 python.display(),
                 script.display()
             )
@@ -76,16 +76,17 @@ impl Torch {
         Ok(torch)
     }
 
-    /// Stops or continues the process. PyTorch's threads spin on after their turn, on cores that ours is timed on.
+    /// Stops or continues the process. PyTorch's idle threads keep spinning and would take cores from rever.
     fn signal(&self, signal: libc::c_int) -> Result<()> {
-        let process = libc::pid_t::try_from(self.process.id()).context("a process id is a pid")?;
-        // SAFETY: a plain system call; the process is a child of ours that nobody has waited for.
+        let process =
+            libc::pid_t::try_from(self.process.id()).context("process id out of range")?;
+        // SAFETY: a plain system call. The process is our child and not yet waited for, so its id is not reused.
         let result = unsafe { libc::kill(process, signal) };
-        ensure!(result == 0, "PyTorch's process has ended");
+        ensure!(result == 0, "the PyTorch process has ended");
         Ok(())
     }
 
-    /// Milliseconds of one decision: prefill, then these tokens of each candidate, with logits and a draw each.
+    /// Milliseconds of one decision: prefill, then these tokens of each candidate, each with logits and sampling.
     pub fn decide(
         &mut self,
         setting: &str,
@@ -94,8 +95,8 @@ impl Torch {
     ) -> Result<f64> {
         let request = serde_json::to_string(&Request { setting, observation, tokens })?;
         self.signal(libc::SIGCONT)?;
-        writeln!(self.requests, "{request}").context("PyTorch's process has ended")?;
-        self.requests.flush().context("PyTorch's process has ended")?;
+        writeln!(self.requests, "{request}").context("the PyTorch process has ended")?;
+        self.requests.flush().context("the PyTorch process has ended")?;
         let answer: Answer = read(&mut self.replies)?;
         self.signal(libc::SIGSTOP)?;
         Ok(answer.ms)
@@ -104,7 +105,7 @@ impl Torch {
 
 impl Drop for Torch {
     fn drop(&mut self) {
-        // It has nothing to save, and it may be gone already.
+        // The process has nothing to save, and it may have ended already.
         self.process.kill().ok();
         self.process.wait().ok();
     }
@@ -113,6 +114,7 @@ impl Drop for Torch {
 fn read<T: for<'de> Deserialize<'de>>(replies: &mut BufReader<ChildStdout>) -> Result<T> {
     let mut line = String::new();
     let count = replies.read_line(&mut line)?;
-    ensure!(count > 0, "PyTorch's process has ended");
-    serde_json::from_str(&line).with_context(|| format!("PyTorch's process said {line:?}"))
+    ensure!(count > 0, "the PyTorch process has ended");
+    serde_json::from_str(&line)
+        .with_context(|| format!("unexpected reply of the PyTorch process: {line:?}"))
 }

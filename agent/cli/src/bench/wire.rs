@@ -1,10 +1,10 @@
-//! What a control step costs over the wire, beside what the simulator needs for it.
+//! Measures the wire's share of a control step.
 //!
-//! A reply to a step says what the simulator took for it; the rest of the round trip is the wire: request, queues, writing
-//! the reply, its picture's way, reading it.
+//! A reply reports the time that the simulator took for the step. The rest of the round trip is the wire: the request,
+//! queues, serializing the reply, transferring its image, deserializing it.
 //!
-//! Beside each step, in turns: the same reply once more, which a server sends without simulating or writing anything, and
-//! as many bytes through a bare socket, which is what this machine takes for them at that hour.
+//! Two baselines are measured alternately with the steps. A repeated reply needs no simulation and no serialization.
+//! The same number of bytes through a bare socket shows how fast this machine is at that time.
 
 use std::f32::consts::TAU;
 use std::io::{Read, Result as IoResult, Write};
@@ -24,59 +24,59 @@ use runtime::servers::{ServerSource, Simulator};
 use runtime::wire::{Environment, Episode, Network};
 use store::plan::SeedRange;
 
-/// Steps before an episode is begun anew: no task's horizon is shorter.
+/// Steps before an episode is reset. No task has a shorter horizon.
 pub(super) const EPISODE_STEPS: usize = 50;
-/// The first steps fill caches.
+/// Steps that are not counted, while caches fill.
 pub(super) const WARM_UP_STEPS: usize = 5;
-/// Control steps for a round of the gripper.
+/// Control steps per circle of the gripper.
 const ROUND_STEPS: f32 = 16.0;
-/// How far it goes in a step, in metres: about as far as in an episode of the expert.
+/// Distance that the gripper moves per step, in metres: about as far as under the expert.
 const STEP_LENGTH: f32 = 0.02;
-/// The local server is on the network already.
+/// How long to wait for the local server to be found. It has joined the network already.
 pub(super) const SERVER_WAIT: Duration = Duration::from_secs(30);
 
-/// A Step as it is sent.
+/// Size of a serialized `Step`.
 const REQUEST_BYTES: usize = 62;
 
-/// One number of sessions on one server, all of them asking at once.
+/// The results for one number of concurrent sessions on one server.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
-    /// What the server is.
+    /// The server's simulator.
     pub simulator: Simulator,
     /// Sessions of the server.
     pub sessions: usize,
-    /// Of all sessions, counted.
+    /// Counted steps of all sessions.
     pub steps: usize,
-    /// One control step with its image: the time of all sessions' steps over their number, median.
+    /// A control step with its image: the time of all sessions' steps divided by the number of sessions, median.
     pub step_ms_p50: f64,
-    /// What of it the simulator took, as the server says: median of the sessions' means.
+    /// The simulator's part of it, as the server reports it: median of the sessions' means.
     pub simulator_ms_p50: f64,
     /// The rest of it, median.
     pub wire_ms_p50: f64,
-    /// The slow ones.
+    /// The same, 95th percentile.
     pub wire_ms_p95: f64,
-    /// A repeated reply: the time of all sessions' repetitions over their number, median.
+    /// A repeated reply: the time of all sessions' replies divided by the number of sessions, median.
     pub repeat_ms_p50: f64,
-    /// A reply: median of the sessions' means.
+    /// Size of a reply: median of the sessions' means.
     pub reply_bytes_p50: f64,
-    /// One request's and one reply's bytes through a socket between two threads, median.
+    /// The bytes of a request and a reply through a socket between two threads, median.
     pub bare_ms_p50: f64,
 }
 
-/// What is timed.
+/// The parameters of the benchmark.
 pub struct WireBench<'a> {
-    /// Where the server is started.
+    /// Source of the local server.
     pub servers: &'a ServerSource,
     /// Numbers of sessions.
     pub sessions: &'a [usize],
     /// Control steps of every session.
     pub steps: usize,
-    /// Of the image, in pixels.
+    /// Height and width of the image in pixels.
     pub side: u32,
 }
 
 impl WireBench<'_> {
-    /// Starts one server and takes turns for each number of sessions.
+    /// Starts one server and measures each number of sessions.
     pub fn run(&self) -> Result<Vec<Row>> {
         ensure!(self.steps > 0, "steps: expected at least 1, got 0");
         ensure!(!self.sessions.contains(&0), "sessions: expected at least 1, got 0");
@@ -107,7 +107,7 @@ impl WireBench<'_> {
         Ok(rows)
     }
 
-    /// Steps and repetitions of these sessions in turns.
+    /// Measures steps and repeated replies of these sessions, alternately.
     async fn count(
         &self,
         environments: Vec<Environment>,
@@ -134,7 +134,7 @@ impl WireBench<'_> {
             })
             .await?;
             let reply_bytes = after.iter().map(Episode::reply_bytes).sum::<usize>() / sessions;
-            let bare_ms = socket.exchange(reply_bytes).context("the socket's other end is gone")?;
+            let bare_ms = socket.exchange(reply_bytes).context("the socket's peer is gone")?;
             if index >= WARM_UP_STEPS {
                 stepped.push(step_ms);
                 simulated.push(simulator_ms);
@@ -167,7 +167,8 @@ impl WireBench<'_> {
     }
 }
 
-/// The gripper goes in circles above the table, and opens and closes: as much of the picture changes as in an episode.
+/// An action that moves the gripper in circles above the table and opens and closes it. The image changes about as much
+/// as in an episode.
 pub(super) fn circling(step: usize) -> [f32; 7] {
     let angle = step as f32 * TAU / ROUND_STEPS;
     let (across, along) = angle.sin_cos();
@@ -175,7 +176,7 @@ pub(super) fn circling(step: usize) -> [f32; 7] {
     [STEP_LENGTH * along, STEP_LENGTH * across, 0.0, 0.0, 0.0, 0.0, gripper]
 }
 
-/// A thread that gives a reply's bytes for a request's bytes; it ends with this.
+/// A socket to a thread that answers each request with the requested number of bytes. Dropping it ends the thread.
 struct BareSocket {
     stream: UnixStream,
     reply: Vec<u8>,
@@ -197,7 +198,7 @@ impl BareSocket {
         Ok(Self { stream, reply: Vec::new() })
     }
 
-    /// Milliseconds of one exchange with so large a reply. Blocks.
+    /// Milliseconds of a request and a reply of this size. Blocks.
     fn exchange(&mut self, reply_bytes: usize) -> IoResult<f64> {
         self.reply.resize(reply_bytes, 0);
         let mut request = [0; REQUEST_BYTES];
@@ -218,7 +219,7 @@ pub(super) async fn default_tasks(network: &Network, server: &str) -> Result<Vec
     Ok(tasks)
 }
 
-/// A session of the task that comes at this place.
+/// Opens the session with this index. Sessions cycle through the tasks.
 pub(super) async fn open(
     network: &Network,
     server: &str,
@@ -239,7 +240,7 @@ pub(super) async fn open(
     Environment::open(network, server, open).await.context("cannot open a session")
 }
 
-/// Begins an episode in every session.
+/// Resets every session.
 pub(super) async fn reset(
     environments: Vec<Environment>,
     tasks: &[TaskId],
@@ -258,7 +259,7 @@ pub(super) async fn reset(
     Ok(episodes)
 }
 
-/// Asks something of all sessions at once; milliseconds over their number, and what came back, in order.
+/// Sends a request to all sessions at once. Returns the milliseconds per session, and the replies in order.
 pub(super) async fn at_once<From, To, Answer>(
     sessions: Vec<From>,
     ask: impl Fn(From) -> Answer,
@@ -270,7 +271,7 @@ where
     let count = sessions.len();
     let begun = Instant::now();
     if count == 1 {
-        // Alone it needs no task beside this one, whose start and end would count as the wire's.
+        // A single session needs no spawned task. Starting and joining one would count as wire time.
         let mut answers = Vec::new();
         for session in sessions {
             answers.push(ask(session).await?);

@@ -1,4 +1,4 @@
-//! `rever bench`: what the parts of the program cost on this machine.
+//! `rever bench`: benchmarks of decisions, episodes, the wire and simulators.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -19,7 +19,7 @@ use crate::bench::{
 use crate::build_info;
 use crate::files::{self, policy_folder};
 
-/// Measure what decisions, episodes, the wire and simulators cost on this machine
+/// Benchmark decisions, episodes, the wire and simulators on this machine
 #[derive(Debug, Args)]
 pub struct Arguments {
     #[command(subcommand)]
@@ -37,40 +37,40 @@ enum Part {
 /// Measure one decision at a time on recorded observations: prefill, decode, parse, score, choose
 #[derive(Debug, Args)]
 struct DecisionArguments {
-    /// The checkpoint's folder [default: the policy that comes with rever]
+    /// Folder of the checkpoint [default: the policy that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
-    /// Where the policy computes: cpu, cuda or cuda:N
+    /// Device that the policy runs on: cpu, cuda or cuda:N
     #[arg(long, default_value_t)]
     device: DeviceName,
-    /// The verifier's file [default: the one beside the policy's weights]
+    /// File of the verifier [default: verifier.safetensors in the policy's folder]
     #[arg(long)]
     verifier: Option<PathBuf>,
-    /// Recorded observations: images and instructions [default: eight of the shipped policy's size]
+    /// File of recorded observations: images and instructions [default: eight in the shipped policy's image size]
     #[arg(long, value_name = "FILE")]
     observations: Option<PathBuf>,
-    /// Passes over all observations
+    /// Number of passes over all observations
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..))]
     rounds: u32,
-    /// Make the same decisions in PyTorch, alternating with rever's
+    /// Also time the same decisions in PyTorch, alternating with rever
     #[arg(long)]
     compare: bool,
     /// Python with PyTorch, for --compare
     #[arg(long, value_name = "FILE", default_value = "python3")]
     python: PathBuf,
-    /// Write the figures to this file as well
+    /// Also write the figures to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 
-/// Measure whole episodes, many at once: decisions and episodes per second, and this process's memory
+/// Measure concurrent episodes: decisions and episodes per second, and the memory of this process
 #[derive(Debug, Args)]
 struct ThroughputArguments {
-    /// Episodes at once, separated by commas
+    /// Numbers of concurrent episodes, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "1,2,4,8,16",
           value_parser = clap::value_parser!(u16).range(1..=256))]
     sessions: Vec<u16>,
-    /// Decisions that are counted for each number of sessions
+    /// Decisions to count for each number of sessions
     #[arg(long, default_value_t = 2_000, value_parser = clap::value_parser!(u64).range(1..))]
     decisions: u64,
     /// Candidates per decision
@@ -79,27 +79,27 @@ struct ThroughputArguments {
     /// Server processes to start
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=64))]
     servers: u16,
-    /// The simulator of these servers
+    /// Simulator of these servers
     #[arg(long, value_enum, default_value_t)]
     simulator: Simulator,
-    /// The checkpoint's folder, with its verifier [default: the policy that comes with rever]
+    /// Folder of the checkpoint and its verifier [default: the policy that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
-    /// Where the policy computes: cpu, cuda or cuda:N
+    /// Device that the policy runs on: cpu, cuda or cuda:N
     #[arg(long, default_value_t)]
     device: DeviceName,
-    /// Python for the servers, with the packages of env-server [default: one that rever sets up]
+    /// Python for the servers, with the packages of env-server [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the figures to this file as well
+    /// Also write the figures to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 
-/// Measure control steps over the wire, minus the simulator's time, beside repeated replies
+/// Measure the wire's share of a control step: its time minus the simulator's
 #[derive(Debug, Args)]
 struct WireArguments {
-    /// Sessions of one server that step at the same time, separated by commas
+    /// Numbers of concurrent sessions on one server, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "1,8,32",
           value_parser = clap::value_parser!(u16).range(1..=64))]
     sessions: Vec<u16>,
@@ -110,10 +110,10 @@ struct WireArguments {
     steps: StepsArguments,
 }
 
-/// Measure control steps of the Python and the native server, with and without an image
+/// Compare control steps of the Python and the native server, with and without an image
 #[derive(Debug, Args)]
 struct SimulatorsArguments {
-    /// Sessions of each server that step at the same time, separated by commas
+    /// Numbers of concurrent sessions on each server, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "1,2,4,8",
           value_parser = clap::value_parser!(u16).range(1..=64))]
     sessions: Vec<u16>,
@@ -121,24 +121,24 @@ struct SimulatorsArguments {
     steps: StepsArguments,
 }
 
-/// What both benchmarks of control steps ask
+/// The arguments that both benchmarks of control steps share
 #[derive(Debug, Args)]
 struct StepsArguments {
-    /// Control steps of every session
+    /// Control steps per session
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
     steps: u32,
     /// Height and width of the image
     #[arg(long, default_value_t = 224, value_parser = clap::value_parser!(u32).range(1..=1024))]
     side: u32,
-    /// Python for the servers, with the packages of env-server [default: one that rever sets up]
+    /// Python for the servers, with the packages of env-server [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the figures to this file as well
+    /// Also write the figures to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 
-/// Times what was asked for and prints a table.
+/// Runs the chosen benchmark and prints a table.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     match arguments.part {
         Part::Decision(arguments) => decision(arguments, host),
@@ -191,8 +191,8 @@ fn wire(arguments: WireArguments, host: &Host) -> Result<()> {
     ];
     print_table(&head, rows.iter().map(row));
     println!(
-        "Medians in ms per step of all sessions, {side} x {side} pixels, one server of each kind. wire: a step minus its\n\
-         simulator's time; share: of the step; repeat: the same reply again; bare: as many bytes through a socket; kB: reply"
+        "Medians in ms per step over all sessions, {side} x {side} pixels, one server per simulator. wire: step minus\n\
+         simulator; share: wire / step; repeat: last reply resent; bare: as many bytes through a socket; kB: reply size"
     );
     Ok(())
 }
@@ -225,12 +225,12 @@ fn simulators(arguments: SimulatorsArguments, host: &Host) -> Result<()> {
     let head = ["pixels", "sessions", "steps", "python", "native", "ratio"];
     print_table(&head, rows.iter().map(row));
     println!(
-        "control steps per second of one server process, measured alternately; 0 pixels: nothing is rendered"
+        "control steps per second of one server process, measured alternately; 0 pixels: no rendering"
     );
     Ok(())
 }
 
-/// Servers of this benchmark alone.
+/// Local servers in a fleet of their own, so that no other server takes part.
 fn servers(
     host: &Host,
     count: usize,
@@ -267,7 +267,7 @@ fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
         write_json(path, serde_json::json!({ "candidates": arguments.candidates, "rows": rows }))?;
     }
     let row = |row: &bench::ThroughputRow| {
-        // Without one that ended, the rate is not known.
+        // If no episode has ended, the rate is unknown.
         let episodes = (row.episodes_per_second > 0.0).then_some(row.episodes_per_second);
         vec![
             row.sessions.to_string(),
@@ -284,13 +284,13 @@ fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
     Ok(())
 }
 
-/// Columns of numbers below their names.
+/// Prints columns of numbers with a header.
 fn print_table(head: &[&str], rows: impl Iterator<Item = Vec<String>>) {
     let head = head.iter().map(|name| (*name).to_owned()).collect();
     print!("{}", aligned(&std::iter::once(head).chain(rows).collect::<Vec<_>>()));
 }
 
-/// Writes an object of figures, with the build that measured them.
+/// Writes the figures as JSON, with the commit of this build.
 fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
     figures["commit"] = build_info::build().commit_text().into();
     let text = serde_json::to_string_pretty(&figures)?;
@@ -300,7 +300,7 @@ fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
 fn decision(arguments: DecisionArguments, host: &Host) -> Result<()> {
     ensure!(
         !arguments.compare || arguments.device == DeviceName::Cpu,
-        "--compare: expected --device cpu, where PyTorch runs, got {}",
+        "--compare: expected --device cpu, because PyTorch runs on the CPU, got {}",
         arguments.device
     );
     let folder = policy_folder(arguments.policy.as_ref(), host)?;
@@ -357,7 +357,8 @@ fn print(report: &Report) {
     print_table(&head, report.rows.iter().map(row));
     let megabytes = report.rows.first().map_or(0.0, |row| row.weight_bytes as f64 / 1e6);
     println!(
-        "{} decisions each, {} threads. A token step reads {megabytes:.1} MB of weights; this machine\nreads as much at {:.1} GB/s.",
+        "{} decisions per row, {} threads. A token step reads {megabytes:.1} MB of weights;\n\
+         this machine reads a buffer of that size at {:.1} GB/s.",
         report.decisions,
         report.threads,
         report.bandwidth_bytes_per_second / 1e9,
@@ -368,16 +369,16 @@ fn print(report: &Report) {
             one.setting, one.candidates, one.decision_ms_p50, one.decision_ms_p95
         );
     }
-    for why in report.torch_hello.iter().flat_map(|hello| &hello.broken) {
-        println!("PyTorch: {why}");
+    for reason in report.torch_hello.iter().flat_map(|hello| &hello.broken) {
+        println!("PyTorch: {reason}");
     }
     println!(
-        "ratio_greedy {:.2} (five verified candidates over one greedy candidate)",
+        "ratio_greedy {:.2} (time of five verified candidates / time of one greedy candidate)",
         report.ratio_greedy
     );
     if let (Some(eager), Some(best)) = (report.ratio_eager, report.ratio_best) {
         println!(
-            "ratio_eager {eager:.2}, ratio_best {best:.2} (PyTorch over rever, five candidates)"
+            "ratio_eager {eager:.2}, ratio_best {best:.2} (time of PyTorch / time of rever, five candidates)"
         );
     }
 }

@@ -1,4 +1,4 @@
-//! `rever collect`: sampled episodes with their outcomes, for the verifier to learn from.
+//! `rever collect`: records sampled episodes and their outcomes as training data for a verifier.
 
 use std::path::PathBuf;
 
@@ -14,36 +14,36 @@ use super::episodes::{EpisodesArguments, Request};
 use super::evaluate::{show, temperature};
 use super::names::StrategyParser;
 
-/// Collect sampled episodes as labels, on random initial layouts that evaluation never uses
+/// Collect labelled episodes for training, on random initial layouts that evaluation never uses
 #[derive(Debug, Clone, Args)]
 #[command(after_help = "Examples:
   rever collect --episodes 200                       800 labelled episodes of the four tasks, then: rever train
-  rever collect --policy FOLDER --episodes 300       for a verifier of your own checkpoint")]
+  rever collect --policy FOLDER --episodes 300       to train a verifier for your own checkpoint")]
 pub struct Arguments {
-    /// How the executed candidate is chosen; `sample` executes the first and records the others
+    /// Strategy that chooses the executed candidate; `sample` executes the first and records the others
     #[arg(long, default_value = "sample", value_parser = StrategyParser)]
     strategy: Strategy,
-    /// Candidates per step; a verifier learns to choose only from two or more
+    /// Candidates per step; a verifier learns to rank candidates only from two or more
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=256))]
     candidates: u32,
     /// Sampling temperature
     #[arg(long, value_name = "T", default_value_t = 1.0, value_parser = temperature)]
     temperature: f32,
-    /// Episodes of each task
+    /// Episodes per task
     #[arg(long, default_value_t = 100, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..))]
     episodes: u32,
     #[command(flatten)]
     episodes_arguments: EpisodesArguments,
-    /// Write the results to this file as well
+    /// Also write the results to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file, help_heading = "Files")]
     json: Option<PathBuf>,
 }
 
-/// Runs what is missing, then prints how many episodes succeeded.
+/// Runs the missing episodes, then prints the success rates.
 pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let Arguments { strategy, candidates, temperature, .. } = arguments;
     let setting = match strategy {
-        // In an evaluation the candidates beside a sample would be a waste of time; here a verifier is trained on them.
+        // `Setting::new` reduces `sample` to one candidate, but a verifier is trained on all of them.
         Strategy::Sample => Setting { strategy, candidates, temperature },
         _ => Setting::new(strategy, candidates, temperature),
     };

@@ -1,4 +1,4 @@
-//! `rever completions` and `rever man`: what a shell and `man` need to know of the command line.
+//! `rever completions` and `rever man`: generate shell completions and man pages.
 
 use std::path::PathBuf;
 
@@ -13,16 +13,16 @@ use super::Program;
 #[command(after_help = "Example:
   rever completions bash > ~/.local/share/bash-completion/completions/rever")]
 pub struct CompletionsArguments {
-    /// The shell
+    /// Shell to generate the script for
     shell: Shell,
 }
 
-/// Write man pages, one for each command
+/// Write man pages, one per command
 #[derive(Debug, Args)]
 #[command(after_help = "Example:
   rever man ~/.local/share/man/man1 && man rever-evaluate")]
 pub struct ManArguments {
-    /// The folder to write to; it is created if there is none
+    /// Folder to write to; created if it does not exist
     folder: PathBuf,
 }
 

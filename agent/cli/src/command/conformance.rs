@@ -18,27 +18,27 @@ pub struct Arguments {
     /// Start one of rever's servers and test it
     #[arg(long, value_enum, conflicts_with = "connect")]
     server: Option<Simulator>,
-    /// Test a running server: HOST:PORT of it or of a router
+    /// Test a running server: HOST:PORT of the server or of a router
     #[arg(long, value_delimiter = ',', value_parser = endpoint)]
     connect: Vec<String>,
     /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
-    /// The id of the server to test, where there are several [default: the first]
+    /// Id of the server to test, if there are several [default: the first]
     #[arg(long)]
     id: Option<String>,
-    /// Python for the server, with the packages of env-server [default: one that rever sets up]
+    /// Python for the server, with the packages of env-server [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the results to this file as well
+    /// Also write the results to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
 
-/// Sessions of a server that is started here: few, so that all of them can be opened.
+/// Sessions of a server that is started here. One of the rules opens all of them, so there are few.
 const SESSIONS: usize = 4;
 
-/// Prints each row when it is done; an error when one fails.
+/// Prints the verdict on each rule as soon as it is known. Returns an error if a rule fails.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     if arguments.server.is_none() && arguments.connect.is_empty() {
         bail!(WrongUsage(
@@ -70,7 +70,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     println!("{passed} passed, {failed} failed, {} not tested", count(Verdict::Skip));
     ensure!(
         failed == 0,
-        "the server departs from the specification in {failed} of {} rules",
+        "the server violates {failed} of {} rules of the specification",
         rows.len()
     );
     Ok(())

@@ -1,4 +1,4 @@
-//! `rever demo`: the whole loop on this machine within minutes, ending with a page to look at.
+//! `rever demo`: runs the whole loop on this machine within minutes and builds a report page.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -14,38 +14,38 @@ use store::plan::SeedRange;
 use super::episodes::{EpisodesArguments, Request};
 use super::{Output, report};
 
-/// Environment servers: one per core of a small machine.
+/// Environment server processes: one per core of a small machine.
 const SERVERS: u16 = 2;
 
-/// What the verifier chooses from, as in the results.
+/// Candidates per step that the verifier chooses among, as in the published results.
 const CANDIDATES: u32 = 5;
 const TEMPERATURE: f32 = 1.0;
 
 /// Compare a single sample with the verifier's choice on all tasks, then build a page with videos
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Random initial layouts of each task; each is run with a single sample and with the verifier
+    /// Random initial layouts per task; each is run with a single sample and with the verifier
     #[arg(long, default_value_t = 6, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..))]
     episodes: u32,
-    /// Another number gives other initial layouts
+    /// Seed of the suite; it determines initial layouts and samples
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// The run's folder; the same command resumes it [default: a folder under runs/]
+    /// Folder of the run; rerun the same command to resume it [default: a folder under runs/]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Write the results to this file as well
+    /// Also write the results to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
-    /// Python for the servers, with the packages of env-server [default: one that rever sets up]
+    /// Python for the servers, with the packages of env-server [default: an environment that rever sets up]
     #[arg(long)]
     python: Option<PathBuf>,
 }
 
-/// Runs the demonstration, prints its tables and where its page is.
+/// Runs the demonstration, then prints its results and the path of its page.
 pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let started = Instant::now();
     println!(
-        "{} random initial layouts of each task, each with a single sample and with the verifier's choice of {CANDIDATES}",
+        "{} random initial layouts per task, each run with a single sample and with the verifier (N = {CANDIDATES})",
         arguments.episodes
     );
     let setting = |strategy| Setting::new(strategy, CANDIDATES, TEMPERATURE);

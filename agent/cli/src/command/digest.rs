@@ -1,4 +1,4 @@
-//! `rever digest`: what the episodes of a run did, as one number to compare.
+//! `rever digest`: computes one digest over all episodes of a run, to compare runs.
 
 use std::path::PathBuf;
 
@@ -8,20 +8,20 @@ use store::record::EpisodeRecord;
 use store::run::{record_path, recorded};
 use store::{combined_digest, episode_digest, hex};
 
-/// Print a digest of what the episodes of a run did
+/// Print a digest of the episodes of a run
 ///
-/// SHA-256 over identity, candidates' tokens, choices, statistics and states. Runs of one suite have one digest on every
-/// machine, whatever the number of servers, the order of episodes or interruptions.
+/// SHA-256 over identities, candidates' tokens, choices, statistics and states. Runs of the same suite have the same
+/// digest on every machine: the number of servers, the order of episodes and interruptions do not change it.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// The run's folder
+    /// Folder of the run
     run: PathBuf,
-    /// Print the digest of each episode as well
+    /// Also print the digest of each episode
     #[arg(long)]
     episodes: bool,
 }
 
-/// Reads one record after the other.
+/// Prints the digest. Only one record is in memory at a time.
 pub fn run(arguments: Arguments) -> Result<()> {
     let mut digests = Vec::new();
     for id in recorded(&arguments.run)? {

@@ -1,6 +1,6 @@
-//! `rever doctor`: tries everything that a run needs, one thing after the other, and says what is missing.
+//! `rever doctor`: checks everything that a run needs and reports what is missing.
 //!
-//! It changes nothing on the machine: what is missing is named with the line that installs it.
+//! It changes nothing on the machine. For a missing part it prints the command that installs it.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -22,16 +22,16 @@ use vla::{DeviceName, Vla};
 use super::names::{FLEET_DEFAULT, endpoint, fleet};
 use crate::files;
 
-/// The image size where there is no policy that asks for another.
+/// The image size if no policy could be loaded.
 const IMAGE_SIZE_DEFAULT: (usize, usize) = (128, 128);
 
 /// Check what a run needs and change nothing: Python, rendering, policy, verifier, servers
 #[derive(Debug, Clone, Args)]
 pub struct Arguments {
-    /// The checkpoint's folder [default: the policy that comes with rever]
+    /// Folder of the checkpoint [default: the policy that comes with rever]
     #[arg(long, value_name = "FOLDER")]
     policy: Option<PathBuf>,
-    /// The verifier's file [default: verifier.safetensors in the policy's folder]
+    /// File of the verifier [default: verifier.safetensors in the policy's folder]
     #[arg(long, value_name = "FILE")]
     verifier: Option<PathBuf>,
     /// Start a server of this simulator
@@ -43,10 +43,10 @@ pub struct Arguments {
     /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
-    /// Python for the server, with the packages of env-server [default: one that rever sets up]
+    /// Python for the server, with the packages of env-server [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
-    /// Write the findings to this file as well
+    /// Also write the findings to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }
@@ -56,11 +56,11 @@ pub struct Arguments {
 struct Finding {
     name: &'static str,
     is_ok: bool,
-    /// What was found, or what is wrong and what to do.
+    /// What was found, or what is wrong and how to fix it.
     text: String,
 }
 
-/// Prints one line per check as it is done; an error when one fails.
+/// Prints one line per check as soon as it is done. Returns an error if a check fails.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let mut findings = Vec::new();
     let installation = files::installation_unchanged(host)?;
@@ -89,7 +89,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         let beside = folder.join("verifier.safetensors");
         let named = arguments.verifier.as_deref();
         if named.is_none() && !beside.is_file() {
-            println!("none  verifier    `rever collect` and `rever train` make one");
+            println!("none  verifier    train one with `rever collect` and `rever train`");
         } else {
             let path = named.unwrap_or(&beside);
             check(&mut findings, "verifier", || check_verifier(path, &installation, policy));
@@ -114,7 +114,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     Ok(())
 }
 
-/// Does one check and prints what it found.
+/// Runs one check and prints its finding.
 fn check<T>(
     findings: &mut Vec<Finding>,
     name: &'static str,
@@ -162,7 +162,7 @@ fn check_policy(folder: &Path, installation: &Installation) -> Result<(Vla, Stri
     let policy = Vla::load(folder, DeviceName::Cpu)?;
     let (height, width) = policy.info().image_size;
     let text = format!(
-        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden state {}",
+        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden size {}",
         place(folder, installation),
         begun.elapsed().as_millis(),
         short(policy.parser().digest()),
@@ -174,10 +174,10 @@ fn check_policy(folder: &Path, installation: &Installation) -> Result<(Vla, Stri
 fn check_verifier(path: &Path, installation: &Installation, policy: &Vla) -> Result<((), String)> {
     let verifier = Verifier::load(path, policy.parser().digest())?;
     let place = place(path, installation);
-    Ok(((), format!("{place}: digest {}, fits the policy", short(verifier.digest()))))
+    Ok(((), format!("{place}: digest {}, matches the policy", short(verifier.digest()))))
 }
 
-/// Files that were unpacked for this command alone are nowhere when it has ended.
+/// The path to print. A temporary installation is deleted when the command ends, so its paths are not printed.
 fn place(path: &Path, installation: &Installation) -> String {
     match path.strip_prefix(&installation.root) {
         Ok(name) if installation.is_temporary() => format!("embedded {}", name.display()),
@@ -235,7 +235,7 @@ async fn try_environment(
 
 fn described(server: &ServerDescription, servers: usize) -> String {
     format!(
-        "{servers} server(s), protocol {} here and {} there, {} {}, {} tasks",
+        "{servers} server(s), protocol {} (server: {}), {} {}, {} tasks",
         PROTOCOL_VERSION,
         server.protocol,
         server.simulator,
@@ -257,10 +257,10 @@ fn check_decision(policy: &Vla, image: &Image, instruction: &str) -> Result<((),
     let proposals = policy.propose_now(&[request])?;
     let milliseconds = begun.elapsed().as_millis();
     let candidates =
-        &proposals.first().ok_or_else(|| anyhow!("the policy answered nothing"))?.candidates;
+        &proposals.first().ok_or_else(|| anyhow!("the policy returned no proposal"))?.candidates;
     let well_formed = candidates.iter().filter(|candidate| candidate.parsed.is_ok()).count();
     let count = candidates.len();
-    ensure!(well_formed > 0, "none of {count} candidates was well formed: is this policy trained?");
+    ensure!(well_formed > 0, "none of {count} candidates is well formed: is this policy trained?");
     Ok(((), format!("{well_formed} of {count} candidates well formed, in {milliseconds} ms")))
 }
 

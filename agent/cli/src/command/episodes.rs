@@ -1,4 +1,4 @@
-//! The arguments that every command which runs episodes takes.
+//! Running episodes: the arguments and the steps that `demo`, `evaluate` and `collect` share.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -24,63 +24,63 @@ use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use super::{Output, WrongUsage, policy, selection};
 use crate::{build_info, files};
 
-/// Processes on this machine unless others are named.
+/// Default number of server processes on this machine.
 const SERVERS_DEFAULT: u16 = 2;
-/// Episodes at once: enough that a matrix product is worth reading its weights.
+/// Default number of concurrent episodes. Batches of this size amortize reading the weights from memory.
 const SESSIONS_DEFAULT: u16 = 16;
-/// The label store of those that name none.
+/// The default label store.
 const LABELS_DEFAULT: &str = "runs/labels.sqlite";
-/// A policy's own verifier, in its folder.
+/// File name of a policy's own verifier, in the policy's folder.
 const VERIFIER_FILE: &str = "verifier.safetensors";
 
-/// Which tasks, where, and what is kept of them.
+/// Which tasks to run, on which servers, and what to record.
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = "Episodes")]
 pub struct EpisodesArguments {
-    /// Tasks, separated by commas: whole names or words of them (`stack`), with `/VARIANT` for a variant; `rever list tasks`
-    /// shows them [default: all that the servers offer, in their default variant]
+    /// Tasks, separated by commas: full names or words of them (`stack`), with `/VARIANT` for a variant; see
+    /// `rever list tasks` [default: all tasks of the servers, in their default variant]
     #[arg(long, value_delimiter = ',', value_parser = task)]
     pub tasks: Vec<TaskId>,
-    /// Seed of the suite: another number gives other initial layouts and other samples
+    /// Seed of the suite; it determines initial layouts and samples
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
-    /// The checkpoint's folder [default: the policy that comes with rever]
+    /// Folder of the checkpoint [default: the policy that comes with rever]
     #[arg(long, value_name = "FOLDER", help_heading = "Policy and verifier")]
     pub policy: Option<PathBuf>,
-    /// Where the policy computes: cpu, cuda or cuda:N
+    /// Device that the policy runs on: cpu, cuda or cuda:N
     #[arg(long, default_value_t, help_heading = "Policy and verifier")]
     pub device: DeviceName,
-    /// The verifier's file [default: verifier.safetensors in the policy's folder, if there is one]
+    /// File of the verifier [default: verifier.safetensors in the policy's folder, if it exists]
     #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
     pub verifier: Option<PathBuf>,
-    /// Follow a published verifier: take up its newest version between episodes
+    /// Follow a published verifier: switch to its newest version between episodes
     #[arg(long, value_name = "NAME", value_parser = names::verifier, help_heading = "Policy and verifier")]
     pub follow_verifier: Option<String>,
     /// Server processes to start on this machine [default: 2]
     #[arg(long, conflicts_with = "connect", value_parser = clap::value_parser!(u16).range(1..=64), help_heading = "Servers")]
     pub servers: Option<u16>,
-    /// The simulator of these servers
+    /// Simulator of these servers
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect", help_heading = "Servers")]
     pub simulator: Simulator,
     /// Use running servers: HOST:PORT of servers or of a router, separated by commas
     #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', value_parser = endpoint, help_heading = "Servers")]
     pub connect: Vec<String>,
-    /// Listen on HOST:PORT for others, such as a trainer that publishes verifiers [default: a socket of this machine]
+    /// Listen on HOST:PORT for peers, such as a trainer that publishes verifiers [default: a local socket]
     #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', value_parser = endpoint, help_heading = "Servers")]
     pub listen: Vec<String>,
     /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet, help_heading = "Servers")]
     pub fleet: String,
-    /// Episodes at once
+    /// Number of concurrent episodes
     #[arg(long, default_value_t = SESSIONS_DEFAULT, value_parser = clap::value_parser!(u16).range(1..=256), help_heading = "Servers")]
     pub sessions: u16,
-    /// Python for the servers, with the packages of env-server [default: one that rever sets up]
+    /// Python for the servers, with the packages of env-server [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE", help_heading = "Servers")]
     pub python: Option<PathBuf>,
-    /// The run's folder; the same command resumes it [default: a folder under runs/]
+    /// Folder of the run; rerun the same command to resume it [default: a folder under runs/]
     #[arg(long, value_name = "FOLDER", help_heading = "Files")]
     pub out: Option<PathBuf>,
-    /// The label store
+    /// File of the label store
     #[arg(long, value_name = "FILE", default_value = LABELS_DEFAULT, help_heading = "Files")]
     pub labels: PathBuf,
     /// Record a video of every episode
@@ -91,40 +91,40 @@ pub struct EpisodesArguments {
     pub all_hidden: bool,
 }
 
-/// What a command asks for beside the common arguments.
+/// What each command adds to the common arguments.
 pub struct Request {
-    /// The command's name, in progress lines and default folders.
+    /// Name of the command, for progress lines and default folders.
     pub title: &'static str,
-    /// Episodes of each task.
+    /// Episodes per task and setting.
     pub episodes: u32,
-    /// Where objects start.
+    /// Fixed or random initial layouts.
     pub layouts: Layouts,
-    /// What the seeds may be used for.
+    /// The range that seeds are drawn from.
     pub range: SeedRange,
-    /// How each episode is run.
+    /// The settings that each episode is run with.
     pub settings: Vec<Setting>,
-    /// Whether nobody named these settings, so that those which cannot be run are left out.
+    /// Whether the settings are the command's defaults. Defaults that cannot be run are skipped.
     pub is_default: bool,
-    /// How much to show.
+    /// How much to print.
     pub output: Output,
 }
 
-/// What a command has when its episodes are done.
+/// What a command gets when its episodes are done.
 pub struct Outcome {
     /// The run's folder.
     pub folder: PathBuf,
-    /// The checkpoint's folder.
+    /// The folder of the checkpoint.
     pub policy: PathBuf,
-    /// Rates and gains of all that is recorded.
+    /// Rates and gains over all recorded episodes.
     pub results: Results,
-    /// What decides the results: options, versions, build.
+    /// What determines the results: options, versions, build.
     pub provenance: Value,
-    /// What became of the episodes.
+    /// How the run ended: episodes that are missing or were given up.
     pub ending: Ending,
 }
 
 impl Default for EpisodesArguments {
-    /// As the command line has it.
+    /// The defaults of the command line.
     fn default() -> Self {
         EpisodesArguments {
             tasks: Vec::new(),
@@ -149,14 +149,14 @@ impl Default for EpisodesArguments {
 }
 
 impl EpisodesArguments {
-    /// Runs what is not recorded yet, and computes the results of all that is.
+    /// Runs the episodes that are not recorded yet, then computes the results of all recorded ones.
     pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
         let folder = files::policy_folder(self.policy.as_ref(), host)?;
         let policy = policy::load(&folder, self.device)?;
         let digest = policy.parser().digest().to_owned();
         let verifier = self.verifier(&folder, &digest)?;
         let settings = self.settings(&request, &folder, verifier.as_deref())?;
-        // Made, if there is none, before anything is run for it.
+        // Opened now, so that a label store that cannot be used fails before any episode runs.
         LabelStore::open(&self.labels).map(drop)?;
         let runtime = Runtime::new().context("cannot start the async runtime")?;
         let versions = build_info::versions(&digest, verifier.as_deref().map(Verifier::digest));
@@ -206,7 +206,7 @@ impl EpisodesArguments {
         Ok(Outcome { folder: run_folder, policy: folder, results, provenance, ending })
     }
 
-    /// The named verifier, or the one beside the policy's weights; none where one is followed and none is named.
+    /// The verifier of `--verifier`, or else the one beside the policy's weights unless a published one is followed.
     fn verifier(&self, policy: &Path, digest: &str) -> Result<Option<Arc<Verifier>>> {
         let beside = policy.join(VERIFIER_FILE);
         let is_beside = self.follow_verifier.is_none() && beside.is_file();
@@ -216,7 +216,7 @@ impl EpisodesArguments {
         verifier.map_err(|error| WrongUsage(format!("{error:#}")).into())
     }
 
-    /// The settings to run; wrong usage where one needs a verifier and there is none. Settings that nobody named do without.
+    /// The settings to run. Without a verifier, a setting that needs one is wrong usage, or skipped if it is a default.
     fn settings(
         &self,
         request: &Request,
@@ -242,11 +242,11 @@ impl EpisodesArguments {
                 "strategy {strategy}: expected a verifier (--verifier FILE), got none: {remedy}"
             )));
         }
-        eprintln!("without a verifier: {remedy}");
+        eprintln!("skipping strategies that need a verifier: {remedy}");
         Ok(settings.iter().copied().filter(is_possible).collect())
     }
 
-    /// The whole names of the tasks where the run is there already, so that servers are only started if something is missing.
+    /// The full names of the tasks, if the run exists already. Servers are then started only if an episode is missing.
     fn recorded_tasks(
         &self,
         request: &Request,
@@ -265,7 +265,7 @@ impl EpisodesArguments {
         Some(tasks.into_iter().map(task).collect())
     }
 
-    /// Everything that decides the results, by name. Where it runs and how many episodes at once does not.
+    /// Everything that determines the results, by name. Servers and concurrency do not.
     fn options(&self, tasks: Vec<String>, request: &Request, settings: &[Setting]) -> Value {
         json!({
             "tasks": tasks,
@@ -275,14 +275,14 @@ impl EpisodesArguments {
             "seed": self.seed,
             "settings": settings.iter().map(Setting::to_string).collect::<Vec<_>>(),
             "follow_verifier": self.follow_verifier,
-            // Sums in another order: the same draws, but for the rare one between two tokens.
+            // Devices add in a different order, which rarely changes which token is drawn.
             "device": self.device.to_string(),
             "all_hidden": self.all_hidden,
             "video": self.video,
         })
     }
 
-    /// The named run's folder, or one that is named after what decides its results.
+    /// The folder of `--out`, or one named after a digest of everything that determines the results.
     fn run_folder(&self, title: &str, options: &Value, versions: &Value) -> PathBuf {
         self.out.clone().unwrap_or_else(|| {
             let digest = Sha256::digest(format!("{options}{versions}"));
@@ -295,7 +295,7 @@ impl EpisodesArguments {
         self.servers(host)?.open(runtime, usize::from(self.sessions))
     }
 
-    /// Where the servers come from.
+    /// The servers to start or to connect to.
     fn servers(&self, host: &Host) -> Result<ServerSource> {
         let start = || -> Result<LocalSource> {
             Ok(LocalSource {
@@ -314,14 +314,14 @@ impl EpisodesArguments {
     }
 }
 
-/// How many episodes the options of a run's header ask for.
+/// Number of episodes that a run's header asks for.
 pub fn planned(header: &Value) -> u64 {
     let options = &header["options"];
     let settings = options["settings"].as_array().map_or(0, Vec::len) as u64;
     tasks_in_order(options).len() as u64 * settings * options["episodes"].as_u64().unwrap_or(0)
 }
 
-/// Reads published verifiers for the policy with this digest.
+/// A loader of published verifiers for the policy with this digest.
 fn load_scorer(policy: String) -> LoadScorer {
     Arc::new(move |update| {
         let verifier = Verifier::from_bytes(&update.weights, &policy)?;
@@ -329,16 +329,16 @@ fn load_scorer(policy: String) -> LoadScorer {
     })
 }
 
-/// Parses a task's name as it is typed.
+/// Parses the name of a task.
 fn task(text: &str) -> Result<TaskId, String> {
     text.trim().parse()
 }
 
-/// Results of all that is recorded in a run, and what they were made with.
+/// The results of all recorded episodes of a run, and their provenance.
 pub fn results(folder: &Path) -> Result<(Results, Value)> {
     let (header, summaries) = (run::read_header(folder)?, run::summaries(folder)?);
     let mut provenance = serde_json::to_value(&header)?;
-    // Of the header's form, not of the result file's.
+    // This is the version of the header's format, not of the result file's.
     provenance.as_object_mut().map(|fields| fields.remove("version"));
     let simulator = summaries.first().map(|summary| summary.simulator.as_str());
     provenance["versions"]["simulator"] = json!(simulator);

@@ -1,4 +1,4 @@
-//! `rever evaluate`: strategies side by side on the same episodes.
+//! `rever evaluate`: compares strategies on the same episodes.
 
 use std::path::{Path, PathBuf};
 
@@ -16,38 +16,38 @@ use super::names::StrategyParser;
 
 const STRATEGIES_DEFAULT: [Strategy; 3] = [Strategy::Greedy, Strategy::Sample, Strategy::Verifier];
 
-/// Evaluate strategies on the same paired episodes; the same command resumes
+/// Evaluate strategies on the same paired episodes; rerun the same command to resume
 #[derive(Debug, Clone, Args)]
 #[command(after_help = "Examples:
   rever evaluate                                     greedy, sample and verifier on SIMPLER's 24 layouts of each task
   rever evaluate --tasks stack --strategies sample,verifier --layouts random --episodes 100
-  rever evaluate --strategies verifier --candidates 1,2,5,8              success against the number of candidates
+  rever evaluate --strategies verifier --candidates 1,2,5,8              success by number of candidates
   rever evaluate --policy FOLDER --strategies greedy,sample              your own checkpoint
-  rever evaluate --connect 10.0.0.7:7447                                 on servers of another machine")]
+  rever evaluate --connect 10.0.0.7:7447                                 on servers on another machine")]
 pub struct Arguments {
-    /// Strategies, separated by commas [default: greedy,sample,verifier; without the last where there is no verifier]
+    /// Strategies, separated by commas [default: greedy,sample,verifier, or greedy,sample if there is no verifier]
     #[arg(long, value_delimiter = ',', value_parser = StrategyParser)]
     strategies: Vec<Strategy>,
-    /// Candidates per step; several numbers, separated by commas, show success against N
+    /// Candidates per step; several numbers, separated by commas, compare values of N
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "5", value_parser = clap::value_parser!(u32).range(1..=256))]
     candidates: Vec<u32>,
-    /// Sampling temperature; several numbers may be given, separated by commas
+    /// Sampling temperature; may be several numbers, separated by commas
     #[arg(long, value_name = "T", value_delimiter = ',', default_value = "1", value_parser = temperature)]
     temperature: Vec<f32>,
-    /// Episodes of each task and setting; with 24, each of SIMPLER's layouts once
+    /// Episodes per task and setting; 24 cover each of SIMPLER's layouts once
     #[arg(long, default_value_t = 24, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..))]
     episodes: u32,
-    /// The fixed initial layouts of each task, in turn, or random ones from the held-out range of seeds
+    /// Initial layouts: the fixed ones of each task, or random ones from the held-out range of seeds
     #[arg(long, value_enum, default_value = "grid")]
     layouts: Layouts,
     #[command(flatten)]
     episodes_arguments: EpisodesArguments,
-    /// Write the results to this file as well
+    /// Also write the results to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file, help_heading = "Files")]
     json: Option<PathBuf>,
 }
 
-/// Runs what is missing, then prints the answer.
+/// Runs the missing episodes, then prints the results.
 pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let Arguments { strategies, temperature, candidates, .. } = &arguments;
     let is_default = strategies.is_empty();
@@ -71,7 +71,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// Prints the results of an outcome and writes its file; an error when it is partial.
+/// Prints the results and writes the result file. Returns an error if the run is incomplete.
 pub fn show(outcome: &Outcome, json: Option<&Path>, output: Output) -> Result<()> {
     print!("{}", output.results(&outcome.results));
     if let Some(path) = json {
@@ -81,7 +81,7 @@ pub fn show(outcome: &Outcome, json: Option<&Path>, output: Output) -> Result<()
     outcome.ending.ensure_complete(&outcome.folder)
 }
 
-/// A temperature that can be sampled at.
+/// Parses a sampling temperature.
 pub fn temperature(text: &str) -> Result<f32, String> {
     let temperature: f32 =
         text.trim().parse().map_err(|_| format!("expected a number, got {text:?}"))?;

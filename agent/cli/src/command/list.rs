@@ -1,4 +1,4 @@
-//! `rever list`: what there is to run, and what was run.
+//! `rever list`: lists tasks, variants, strategies, runs and servers.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -26,19 +26,19 @@ pub struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum What {
-    /// The tasks of a server, in their default variant
+    /// List the tasks of a server, in their default variant
     Tasks(ServerArguments),
-    /// All variants of all tasks of a server
+    /// List all variants of all tasks of a server
     Variants(ServerArguments),
-    /// The strategies that choose among candidates
+    /// List the strategies that choose among candidates
     Strategies,
-    /// The runs in a folder
+    /// List the runs in a folder
     Runs {
-        /// The folder
+        /// Folder that holds the runs
         #[arg(default_value = "runs")]
         folder: PathBuf,
     },
-    /// The servers that are running at an address
+    /// List the servers found at an address
     Servers {
         /// HOST:PORT of servers or of a router, separated by commas
         #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', required = true, value_parser = endpoint)]
@@ -49,19 +49,19 @@ enum What {
     },
 }
 
-/// Where the descriptions of tasks come from.
+/// The servers that describe the tasks.
 #[derive(Debug, Args)]
 struct ServerArguments {
-    /// Ask running servers: HOST:PORT of servers or of a router, separated by commas [default: start one here]
+    /// Ask running servers: HOST:PORT of servers or of a router, separated by commas [default: start a server]
     #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', value_parser = endpoint)]
     connect: Vec<String>,
     /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
-    /// The simulator to start
+    /// Simulator to start
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
     simulator: Simulator,
-    /// Python for the server, with the packages of env-server [default: one that rever sets up]
+    /// Python for the server, with the packages of env-server [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
 }
@@ -100,24 +100,24 @@ impl ServerArguments {
     }
 }
 
-/// The servers that are found within the time for discovery.
+/// The servers found within the time for discovery.
 fn ask(source: &ServerSource) -> Result<Fleet> {
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
     let deployment = source.open(&runtime, 1)?;
     let fleet = runtime.block_on(deployment.first_servers());
     let fleet = fleet.map(|first| match source.local {
         Some(_) => first,
-        // Others may answer a little later.
+        // Other servers may answer a little later.
         None => runtime.block_on(deployment.network.servers(usize::MAX, OTHERS_WAIT)),
     });
     deployment.close(&runtime)?;
     fleet
 }
 
-/// Of a command line in the list of runs.
+/// Maximum length of a command line in the list of runs.
 const COMMAND_CHARACTERS_MAX: usize = 60;
 
-/// How long to listen for more servers than the first.
+/// How long to wait for further servers after the first.
 const OTHERS_WAIT: std::time::Duration = std::time::Duration::from_secs(2);
 
 fn tasks(fleet: &Fleet, is_listed: impl Fn(&TaskDescription) -> bool) -> Vec<Vec<String>> {
@@ -139,7 +139,7 @@ fn tasks(fleet: &Fleet, is_listed: impl Fn(&TaskDescription) -> bool) -> Vec<Vec
         ]
     };
     let rows = listed.values().zip(short_names(&ids)).map(row);
-    headed(["name", "whole name", "steps", "layouts", "instruction"], rows)
+    headed(["name", "full name", "steps", "layouts", "instruction"], rows)
 }
 
 fn servers(fleet: &Fleet) -> Vec<Vec<String>> {
@@ -153,7 +153,7 @@ fn servers(fleet: &Fleet) -> Vec<Vec<String>> {
         ]
     };
     let left_out = fleet.undescribed.iter().map(|(server, reason)| {
-        vec![server.clone(), "left out".to_owned(), String::new(), String::new(), reason.clone()]
+        vec![server.clone(), "skipped".to_owned(), String::new(), String::new(), reason.clone()]
     });
     let rows = fleet.servers.values().map(row).chain(left_out);
     headed(["server", "simulator", "sessions", "tasks", ""], rows)
@@ -189,7 +189,7 @@ fn runs(folder: &Path) -> Result<Vec<Vec<String>>> {
     Ok(headed(["started", "run", "episodes", "command"], rows.into_iter()))
 }
 
-/// The beginning of a command line: what a run is about comes first.
+/// Truncates a command line at its end: the command and its main options come first.
 fn shortened(command: &str) -> String {
     match command.char_indices().nth(COMMAND_CHARACTERS_MAX) {
         Some((end, _)) => format!("{}...", &command[..end]),

@@ -1,4 +1,4 @@
-//! The subcommands: each file holds the arguments of one and the function that runs it.
+//! The subcommands: each file holds the arguments of one subcommand and the function that runs it.
 
 mod bench;
 mod collect;
@@ -28,7 +28,7 @@ use evaluation::table::{self, COLUMNS_DEFAULT};
 use runtime::servers::Host;
 use tracing_subscriber::EnvFilter;
 
-/// Evaluate reasoning robot policies: sample several candidates per step, verify them, execute the best one.
+/// Evaluate reasoning VLA policies: sample several candidates per step, verify them, execute the best one
 #[derive(Debug, Parser)]
 #[command(
     name = "rever",
@@ -36,7 +36,7 @@ use tracing_subscriber::EnvFilter;
     max_term_width = 100,
     subcommand_help_heading = "Commands",
     after_help = "\
-Start with `rever demo`. Every run is a folder: the same command resumes it after Ctrl-C, a crash or kill -9.
+Start with `rever demo`. Every run is a folder. After Ctrl-C, a crash or kill -9, rerun the same command to resume it.
 
 Exit status: 0 complete, 1 fault or incomplete run, 2 wrong usage, 130 stopped by Ctrl-C.
 Environment: REVER_LOG  log filter, such as debug or runtime=trace [default: warn]
@@ -50,7 +50,7 @@ pub struct Program {
     command: Command,
 }
 
-/// How much to show.
+/// How much to print.
 #[derive(Debug, Clone, Copy, Args)]
 struct Verbosity {
     /// Show all tables, and log more; -vv logs debug messages
@@ -78,17 +78,17 @@ enum Command {
     Man(completions::ManArguments),
 }
 
-/// What a command prints.
+/// How much a command prints.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Output {
-    /// All tables.
+    /// Print all tables.
     pub is_verbose: bool,
-    /// Results and errors only.
+    /// Print results and errors only.
     pub is_quiet: bool,
 }
 
 impl Output {
-    /// The results of a run as text: the answer, and everything else where that was asked for.
+    /// The results of a run as text: the answer, and with `-v` all tables.
     pub fn results(self, results: &Results) -> String {
         let columns = terminal_size::terminal_size().map(|(width, _)| usize::from(width.0));
         let answer = table::answer(results, columns.unwrap_or(COLUMNS_DEFAULT));
@@ -101,7 +101,7 @@ impl Output {
 }
 
 impl Program {
-    /// Runs the chosen subcommand to its end.
+    /// Runs the chosen subcommand.
     pub fn run(self, host: &Host) -> Result<()> {
         let Verbosity { verbose, quiet: is_quiet } = self.verbosity;
         let output = Output { is_verbose: verbose > 0, is_quiet };
@@ -122,9 +122,9 @@ impl Program {
         }
     }
 
-    /// Sends the log to standard error. `filter` is in the form of `tracing` and replaces what -v and -q say.
+    /// Sends the log to standard error. `filter` has the syntax of `tracing` and overrides -v and -q.
     pub fn start_log(&self, filter: Option<&str>, has_colours: bool) {
-        // Progress and results have their own lines. What matters of zenoh's is returned as an error.
+        // Zenoh's log is off: the errors that matter are returned as errors.
         let default = match self.verbosity {
             Verbosity { quiet: true, .. } => "error,zenoh=off",
             Verbosity { verbose: 0, .. } => "warn,zenoh=off",
@@ -139,7 +139,7 @@ impl Program {
     }
 }
 
-/// The command line asks for something that there is not; found out before anything was started.
+/// The command line asks for something that does not exist. Detected before anything is started.
 #[derive(Debug)]
 pub struct WrongUsage(pub String);
 
@@ -151,7 +151,7 @@ impl fmt::Display for WrongUsage {
 
 impl std::error::Error for WrongUsage {}
 
-/// A file that is written at the end of the command, tried before anything is done for it.
+/// Parses the path of an output file. A file that cannot be written is an error now, not at the end of the command.
 pub fn output_file(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     store::check_writable(&path).map_err(|error| format!("{error:#}"))?;

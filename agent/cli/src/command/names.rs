@@ -1,14 +1,14 @@
-//! Names as arguments: endpoints, fleets, verifiers, strategies. What cannot be used is wrong usage, found before any wait.
+//! Parsers of arguments: endpoints, fleets, verifiers, strategies. Invalid ones are wrong usage before anything starts.
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use decision::Strategy;
 use protocol::Keys;
 use runtime::wire::check_endpoint;
 
-/// The fleet of those that name none.
+/// The default fleet.
 pub const FLEET_DEFAULT: &str = "local";
 
-/// Parses `HOST:PORT` or an endpoint as zenoh writes it, `tcp/HOST:PORT`.
+/// Parses `HOST:PORT`, or an endpoint in zenoh's syntax: `tcp/HOST:PORT`.
 pub fn endpoint(text: &str) -> Result<String, String> {
     let text = text.trim();
     let whole = match text.contains('/') {
@@ -20,7 +20,7 @@ pub fn endpoint(text: &str) -> Result<String, String> {
     Ok(whole)
 }
 
-/// Parses a fleet's name.
+/// Parses the name of a fleet.
 pub fn fleet(text: &str) -> Result<String, String> {
     Keys::new(text).map_err(|error| error.to_string())?;
     Ok(text.to_owned())
@@ -33,7 +33,7 @@ pub fn verifier(text: &str) -> Result<String, String> {
     Ok(text.to_owned())
 }
 
-/// Parses the name of a strategy; help lists all of them with their meanings.
+/// Parses the name of a strategy. `--help` lists all strategies with their meanings.
 #[derive(Clone)]
 pub struct StrategyParser;
 

@@ -1,4 +1,4 @@
-//! Loads the policy that a command line names; what cannot be used is wrong usage, with what to do.
+//! Loads the policy of `--policy`. A folder that cannot be used is wrong usage; the message says what to do.
 
 use std::path::Path;
 
@@ -7,13 +7,13 @@ use vla::{DeviceName, Vla};
 
 use super::WrongUsage;
 
-/// Loads a checkpoint's folder onto a device.
+/// Loads a checkpoint onto a device.
 pub fn load(folder: &Path, device: DeviceName) -> Result<Vla> {
     let name = folder.display();
     if !folder.is_dir() {
         return Err(WrongUsage(format!(
-            "--policy: expected a checkpoint's folder, got {name}, which is none; a checkpoint on the Hugging Face Hub is \
-             downloaded with `hf download OWNER/NAME --local-dir FOLDER`"
+            "--policy: expected a checkpoint's folder, but {name} is not a folder; download a checkpoint from the \
+             Hugging Face Hub with `hf download OWNER/NAME --local-dir FOLDER`"
         ))
         .into());
     }

@@ -1,4 +1,4 @@
-//! Which tasks a command is about: names as they were typed, matched with what servers offer.
+//! Task selection: matches the names on the command line with the tasks that servers offer.
 
 use anyhow::Result;
 use decision::TaskId;
@@ -10,7 +10,7 @@ use tokio::runtime::Runtime;
 
 use super::WrongUsage;
 
-/// The tasks that were asked for as servers offer them, each once; without any, all of the default variant.
+/// The requested tasks as servers offer them, without duplicates. By default all tasks in their default variant.
 pub fn offered(
     asked: &[TaskId],
     deployment: &Deployment,
@@ -26,7 +26,7 @@ pub fn offered(
     Ok(ids.iter().filter_map(find).collect())
 }
 
-/// Whole names of the tasks that were asked for, each once and in the order of the command line.
+/// Full names of the requested tasks, without duplicates and in the order of the command line.
 pub fn matching(asked: &[TaskId], offered: &[TaskId]) -> Result<Vec<TaskId>> {
     let mut tasks: Vec<TaskId> = Vec::new();
     for name in asked {

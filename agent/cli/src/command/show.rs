@@ -1,4 +1,4 @@
-//! `rever show`: what a run, a verifier or a policy is, without running anything.
+//! `rever show`: describes a run, a verifier or a policy without running anything.
 
 use std::path::{Path, PathBuf};
 
@@ -11,18 +11,18 @@ use vla::CompletionParser;
 
 use super::{Output, WrongUsage, episodes, train};
 
-/// Show the results of a run, the quality of a verifier, or what a policy is
+/// Show the results of a run, the metrics of a verifier or the sizes of a policy
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
-  rever show runs/evaluate-1a2b3c4d        its results again; with -v all tables
-  rever show verifier.safetensors          what it was trained on, and its held-out quality
+  rever show runs/evaluate-1a2b3c4d        its results; with -v all tables
+  rever show verifier.safetensors          its training data and held-out metrics
   rever show FOLDER                        a checkpoint's sizes, prompt and digest")]
 pub struct Arguments {
-    /// A run's folder, a verifier's file or a checkpoint's folder
+    /// Folder of a run, file of a verifier or folder of a checkpoint
     path: PathBuf,
 }
 
-/// Prints it.
+/// Prints the description.
 pub fn run(arguments: &Arguments, output: Output) -> Result<()> {
     let path = &arguments.path;
     if run::read_header(path).is_ok() {

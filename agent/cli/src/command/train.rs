@@ -1,4 +1,4 @@
-//! `rever train`: trains a verifier on collected episodes; its held-out quality is printed and kept in its file.
+//! `rever train`: trains a verifier on collected episodes, prints its held-out metrics and stores them in its file.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -22,31 +22,31 @@ use super::WrongUsage;
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use crate::files::policy_folder;
 
-/// How long to look for agents that follow the verifier before it is published to nobody yet.
+/// How long to wait for an agent that follows the verifier. After that it is published anyway.
 const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
 
 /// Train a verifier on collected episodes
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
-  rever train                                        on all collected episodes of this folder's label store
+  rever train                                        on all eligible episodes in runs/labels.sqlite
   rever train runs/collect-1a2b3c4d --out mine.safetensors
-  rever train --policy FOLDER --out FOLDER/verifier.safetensors      found beside the policy from then on")]
+  rever train --policy FOLDER --out FOLDER/verifier.safetensors      as the policy's default verifier")]
 pub struct Arguments {
     /// Runs to train on; every episode in them must be eligible [default: the label store]
     runs: Vec<PathBuf>,
     /// Label store to train on; episodes that are not eligible are excluded and counted
     #[arg(long, default_value = "runs/labels.sqlite", conflicts_with = "runs")]
     labels: PathBuf,
-    /// Folder of the policy whose hidden states the records hold [default: the policy that comes with rever]
+    /// Folder of the policy that collected the episodes [default: the policy that comes with rever]
     #[arg(long, value_name = "FOLDER")]
     policy: Option<PathBuf>,
-    /// The file to write the verifier to
+    /// File to write the verifier to
     #[arg(long, default_value = "verifier.safetensors", value_parser = super::output_file)]
     out: PathBuf,
-    /// Seed of the split, of the initial weights and of the order of samples
+    /// Seed of the data split, the initial weights and the sample order
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
-    /// Epochs at most
+    /// Maximum number of epochs
     #[arg(long, default_value_t = TrainingOptions::default().epochs_max)]
     epochs: usize,
     /// Sizes of the two hidden layers
@@ -58,19 +58,19 @@ pub struct Arguments {
     /// Weight decay of the optimizer
     #[arg(long, default_value_t = TrainingOptions::default().weight_decay)]
     weight_decay: f64,
-    /// Share of each task's initial layouts whose loss decides when training stops
+    /// Share of each task's initial layouts used for validation (early stopping)
     #[arg(long, default_value_t = TrainingOptions::default().validation_share)]
     validation_share: f64,
-    /// Share of each task's initial layouts that is held out for the printed figures
+    /// Share of each task's initial layouts held out for the printed metrics
     #[arg(long, default_value_t = TrainingOptions::default().held_out_share)]
     held_out_share: f64,
-    /// Factor on the weights of the distance to the predicted target; 0 leaves the target out
+    /// Factor on the weights of the distance to the predicted target; 0 disables the target
     #[arg(long, default_value_t = TrainingOptions::default().target_factor)]
     target_factor: f64,
-    /// Train the paper's verifier: without the ranking of candidates
+    /// Train the paper's verifier, without the ranking of candidates
     #[arg(long)]
     plain: bool,
-    /// Write the results to this file as well
+    /// Also write the results to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
     /// Publish the verifier under this name to agents that follow it
@@ -82,7 +82,7 @@ pub struct Arguments {
     /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
-    /// After publishing, stay until Ctrl-C so that agents that start later receive the verifier
+    /// Keep publishing until Ctrl-C, so that agents that start later receive the verifier
     #[arg(long, requires = "name")]
     keep_publishing: bool,
 }
@@ -94,16 +94,16 @@ struct ResultFile<'a> {
     verifier: &'a str,
     /// Where it was written.
     path: &'a Path,
-    /// Everything that the verifier says about itself.
+    /// The verifier's description, as stored in its file.
     #[serde(flatten)]
     description: &'a VerifierDescription,
-    /// Numbers of excluded episodes by reason.
+    /// Number of excluded episodes per reason.
     excluded: &'a Excluded,
-    /// From the first record read to the file written.
+    /// From the start of the command until the verifier is written.
     wall_secs: f64,
 }
 
-/// Trains, prints, writes, publishes.
+/// Trains and writes the verifier, prints its metrics, and publishes it if `--name` is given.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let started = Instant::now();
     let options = options(&arguments)?;
@@ -121,7 +121,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     );
     let set = TrainingSet::new(parser.hidden_size(), action_space.length(), episodes)?;
     let (count, repeats) = (set.episodes().len(), set.repeats());
-    eprintln!("{count} episodes, {repeats} repeats left out, excluded: {}", counts(&excluded));
+    eprintln!("{count} episodes, {repeats} repeats skipped, excluded: {}", counts(&excluded));
     let verifier = train(&set, parser.digest(), &options, |epoch| report(epoch, &options))?;
     write_whole(&arguments.out, verifier.bytes())?;
     print!("{}", table(&verifier));
@@ -186,7 +186,7 @@ fn report(epoch: Epoch, options: &TrainingOptions) {
     );
 }
 
-/// Reasons and their numbers in one line.
+/// The count of each reason, in one line.
 fn counts(excluded: &Excluded) -> String {
     if excluded.is_empty() {
         return "none".to_owned();
@@ -198,7 +198,7 @@ fn counts(excluded: &Excluded) -> String {
         .join(", ")
 }
 
-/// What the verifier was trained on, and the held-out figures: per task first, because the pooled one misleads.
+/// Training data and held-out metrics as text. AUROC per task comes first, because the pooled one is misleading.
 pub fn table(verifier: &Verifier) -> String {
     let VerifierDescription { policy, data, held_out, .. } = verifier.description();
     let mut rows = vec![
@@ -236,7 +236,7 @@ pub fn table(verifier: &Verifier) -> String {
             data.held_out_samples
         ),
         aligned(&rows),
-        "Pooled AUROC also rises when a verifier tells easy tasks from hard ones.\n".to_owned(),
+        "Pooled AUROC also rises if a verifier only separates easy from hard tasks.\n".to_owned(),
         format!(
             "held-out loss {}, Brier score {}, calibration error {} ({} bins)\n",
             figure(held_out.loss),
@@ -248,11 +248,11 @@ pub fn table(verifier: &Verifier) -> String {
     figures.concat()
 }
 
-/// The gain of the ranking beside that of the medoid, from re-ranking single decisions.
+/// The estimated gains of the ranking and of the medoid, from re-ranking single decisions.
 fn ranking_text(verifier: &Verifier) -> String {
     let Some(ranking) = &verifier.description().ranking else {
         let text = format!(
-            "no ranking of candidates: it needs {EPISODES_MIN} training and validation episodes of `rever collect --candidates 5`, and no --plain"
+            "no ranking of candidates: it needs {EPISODES_MIN} training and validation episodes from `rever collect --candidates 5`, without --plain"
         );
         return wrapped(&text, COLUMNS_DEFAULT);
     };
@@ -273,7 +273,7 @@ fn figure(value: Option<f64>) -> String {
     value.map_or("–".to_owned(), |value| format!("{value:.3}"))
 }
 
-/// The first digits of a digest: enough to tell versions apart by eye.
+/// The first digits of a digest, enough to distinguish versions by eye.
 fn short(digest: &str) -> &str {
     digest.get(..12).unwrap_or(digest)
 }
@@ -298,7 +298,7 @@ fn publish(arguments: &Arguments, name: &str, verifier: &Verifier) -> Result<()>
             println!("published {digest} as {name}, but no agent follows it yet");
         }
         if arguments.keep_publishing {
-            println!("serving it to agents that start later; Ctrl-C ends");
+            println!("serving it to agents that start later; press Ctrl-C to stop");
             tokio::signal::ctrl_c().await?;
         }
         drop(publisher);

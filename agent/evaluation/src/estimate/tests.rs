@@ -18,7 +18,7 @@ fn successes(successes: usize, episodes: usize) -> TaskClusters {
     single((0..episodes).map(|index| index < successes))
 }
 
-/// Pairs in which both succeed, only the first, only the second, neither.
+/// Numbers of pairs in which both succeed, only the first, only the second, neither.
 fn pairs(cells: [usize; 4]) -> (TaskClusters, TaskClusters) {
     let kinds = [(true, true), (true, false), (false, true), (false, false)];
     let all = || kinds.iter().zip(cells).flat_map(|(kind, count)| std::iter::repeat_n(kind, count));
@@ -85,7 +85,8 @@ fn no_interval_is_without_width_even_where_all_pairs_agree() {
 
 #[test]
 fn a_single_pair_per_task_decides_nothing_that_half_the_tasks_contradict() {
-    // `rever demo --episodes 1`: the verifier wins on two tasks of four and ties on two. It was +50.0 [+50.0, +50.0].
+    // `rever demo --episodes 1`: the verifier wins on two tasks of four and ties on two. The interval once had zero
+    // width: +50.0 [+50.0, +50.0].
     let (win, tie) = (pairs([0, 1, 0, 0]), pairs([1, 0, 0, 0]));
     let better = [win.0.clone(), win.0, tie.0.clone(), tie.0];
     let worse = [win.1.clone(), win.1, tie.1.clone(), tie.1];
@@ -99,15 +100,15 @@ fn a_single_pair_per_task_decides_nothing_that_half_the_tasks_contradict() {
 fn repeats_of_one_start_say_less_than_starts_would() {
     let cluster = |mean| Cluster { mean, episodes: 3.0 };
     let interval = |means: [f64; 8]| Rate::over_tasks(&[means.map(cluster).to_vec()]).interval;
-    // All episodes of a start alike: as 4 of 8.
+    // All episodes of a start have the same outcome: the interval is that of 4 of 8.
     let alike = interval([1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
     near(alike.low, wilson(0.5, 8.0).low, 1e-12);
-    // As different within a start as they are at all: as 12 of 24.
+    // Episodes vary within a start as much as overall: the interval is that of 12 of 24.
     let third = 1.0 / 3.0;
     let different =
         interval([third, third, third, third, 2.0 * third, 2.0 * third, 2.0 * third, 2.0 * third]);
     near(different.low, wilson(0.5, 24.0).low, 1e-12);
-    // Nothing is known of how alike they are where all succeed: as 8 of 8.
+    // If all succeed, the correlation is unknown: the interval is that of 8 of 8.
     near(interval([1.0; 8]).low, wilson(1.0, 8.0).low, 1e-12);
 }
 
@@ -119,7 +120,7 @@ fn headroom_is_the_share_of_the_gap_to_the_oracle_with_an_interval() {
     let interval = half.interval.expect("ends");
     assert!(0.1 < interval.low && interval.low < 0.5, "{half:?}");
     assert!(0.5 < interval.high && interval.high < 0.9, "{half:?}");
-    // What ends the interval is what can just not be refuted.
+    // The end of the interval is the last ratio that is not rejected.
     let rest = remainder(&of(6), &of(12), &of(18), interval.high).expect("an interval");
     near(rest.high.abs().min(rest.low.abs()), 0.0, 1e-9);
     let worse = headroom(&of(12), &of(6), &of(18)).expect("headroom");
@@ -131,21 +132,21 @@ fn headroom_is_the_share_of_the_gap_to_the_oracle_with_an_interval() {
     assert_eq!(headroom(&of(6), &of(8), &of(6)), None, "there is no gap");
 }
 
-/// What is simulated: tasks and starts, episodes of each start, rates of settings, and how much episodes have in common.
+/// A simulated run: tasks, starts, episodes per start, rates of settings, and the correlation of episodes.
 struct Simulation {
     tasks: usize,
     starts: usize,
     repeats: usize,
-    /// Of each setting, the same on all tasks.
+    /// True rate of each setting, the same on all tasks.
     rates: Vec<f64>,
-    /// The chance that a start draws one number for all settings: what makes pairs agree.
+    /// Probability that a setting uses the number that an episode draws for all settings, so that pairs agree.
     agreement: f64,
-    /// The chance that a start draws one number for all its episodes: what makes them a cluster.
+    /// Probability that a start draws one number for all its episodes, so that they are a cluster.
     likeness: f64,
 }
 
 impl Simulation {
-    /// One run, a list of tasks for each setting.
+    /// The outcomes of one run: for each setting, the clusters of each task.
     fn run(&self, random: &mut ChaCha8Rng) -> Vec<Vec<TaskClusters>> {
         let mut settings = vec![vec![Vec::new(); self.tasks]; self.rates.len()];
         for task in 0..self.tasks {
@@ -170,7 +171,7 @@ impl Simulation {
         settings
     }
 
-    /// The share of runs of which `holds` is true.
+    /// The share of runs for which `holds` is true.
     fn share(&self, seed: u64, holds: impl Fn(&[Vec<TaskClusters>]) -> bool) -> f64 {
         const RUNS: u32 = 2000;
         let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -217,7 +218,7 @@ fn intervals_of_rates_hold_the_truth_in_95_of_100_runs() {
         })
         .collect();
     let least = shares.iter().copied().fold(1.0, f64::min);
-    // Wilson's interval of four trials holds one half in 14 of 16 cases: those with one to three successes.
+    // Wilson's interval of four trials contains one half in 14 of 16 cases: those with one to three successes.
     assert!(least > 0.86, "{least}: {shares:?}");
     assert!((0.94..0.975).contains(&mean_of(&shares)), "{}: {shares:?}", mean_of(&shares));
 }
@@ -231,7 +232,7 @@ fn intervals_of_gains_hold_the_truth_in_95_of_100_runs() {
             let truth = simulation.rates[0] - simulation.rates[1];
             simulation.share(2, |run| {
                 let gain = gain(&run[0], &run[1]).expect("pairs");
-                // A gain of two rates may differ from the truth in its last bit.
+                // A difference of two rates may differ from the truth in its last bit.
                 gain.interval.low - 1e-9 <= truth && truth <= gain.interval.high + 1e-9
             })
         })
@@ -269,7 +270,7 @@ fn intervals_of_clustered_episodes_hold_the_truth_in_95_of_100_runs() {
     };
     let rate = simulation.share(4, |run| Rate::over_tasks(&run[0]).interval.contains(0.8));
     assert!((0.93..0.975).contains(&rate), "{rate}");
-    // The same episodes counted as if each had a start of its own.
+    // The same episodes, analysed as if each had its own start.
     let naive = simulation.share(4, |run| {
         let value = Rate::over_tasks(&run[0]).value.expect("a rate");
         wilson(value, 4.0 * 24.0 * 3.0).contains(0.8)

@@ -1,4 +1,4 @@
-//! Tests of results on made-up runs whose figures are known.
+//! Tests of results on synthetic runs with known figures.
 
 use decision::Strategy;
 use serde_json::json;
@@ -63,7 +63,7 @@ fn on_layout(mut summary: EpisodeSummary, layout: u32) -> EpisodeSummary {
     summary
 }
 
-/// A single sample solves a quarter, the verifier half, the oracle all of eight episodes on two tasks.
+/// Eight episodes on two tasks: a single sample solves a quarter, the verifier half, the oracle all.
 fn made_up() -> Vec<EpisodeSummary> {
     let mut all = Vec::new();
     for task in [TASKS[1], TASKS[0]] {
@@ -150,7 +150,7 @@ fn malformed_candidates_and_held_steps_are_counted_per_setting() {
 
 #[test]
 fn repeats_of_a_deterministic_episode_count_once() {
-    // 24 fixed layouts, three times over: nothing in them differs but their numbers.
+    // 24 fixed layouts, each run three times: the episodes differ only in their numbers.
     let of = |strategy: Strategy, episode: u32| {
         let is_success = (episode % 24) < 4;
         on_layout(summary(TASKS[0], episode, strategy, is_success), episode % 24)
@@ -164,7 +164,7 @@ fn repeats_of_a_deterministic_episode_count_once() {
     assert_eq!((rate.episodes, rate.starts), (24, 24));
     assert_eq!(thrice.settings[0].all.counts.repeats, 48);
     assert!(thrice.counted.contains("widowx_spoon_on_towel-default-0000-greedy-n1-t0"));
-    // Sampled episodes of one layout differ, but they are no 72 layouts.
+    // Sampled episodes of one layout differ, but there are still only 24 layouts.
     let sampled: Vec<EpisodeSummary> =
         (0..72).map(|episode| of(Strategy::Sample, episode)).collect();
     let sampled = results(&sampled).settings[0].all;
@@ -196,10 +196,10 @@ fn only_common_episodes_are_paired() {
     summaries.push(summary(TASKS[0], 9, Strategy::Verifier, true));
     let of_common = results(&summaries);
     assert_eq!(of_common.gains[0].gain.pairs, 8);
-    // The headroom, too, is over the episodes that all three have: it was a ratio of rates over different ones.
+    // Headroom is also computed over common episodes only, not from rates over different ones.
     let expected = results(&made_up()).headroom;
     assert_eq!(of_common.headroom, expected);
-    // Without any pair in one task there is no average over all tasks.
+    // If a task has no pair, there is no average over all tasks.
     summaries.retain(|one| {
         one.identity.task != TASKS[1] || one.identity.strategy != Strategy::Sample.name()
     });
@@ -210,7 +210,7 @@ fn only_common_episodes_are_paired() {
 
 #[test]
 fn a_partial_run_has_one_definition_of_average() {
-    // Seven episodes of one task and three of the other: what is said of the rates adds up to what is said of the gain.
+    // Seven episodes of one task and four of the other: the gain is still the difference of the rates.
     let mut summaries = made_up();
     for episode in 4..7 {
         summaries.push(summary(TASKS[0], episode, Strategy::Sample, true));
@@ -294,7 +294,7 @@ fn the_headline_names_the_default_setting_and_what_is_open() {
     summaries.retain(|one| one.identity.candidates < 5);
     let text = Headline::new(&results(&summaries)).expect("a headline").text();
     assert!(text.contains("among 2 candidates"), "the nearest that there is: {text}");
-    assert!(text.contains("Not clear yet: the interval includes 0. If the gain is of"), "{text}");
+    assert!(text.contains("Not clear yet: the interval includes 0. About "), "{text}");
     summaries.retain(|one| one.identity.candidates < 2);
     let text = Headline::new(&results(&summaries)).expect("a headline").text();
     let expected = "A single sample (sample T=1) succeeds in 33.3 % of episodes (95 % interval 9.7 to 70.0, 6 episodes).";

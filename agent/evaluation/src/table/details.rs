@@ -1,4 +1,4 @@
-//! The tables behind the answer: every rate, count and time of a run, each with a sentence that says what to see in it.
+//! All tables of a run: rates, gains, headroom, counts and times.
 
 use decision::Strategy;
 
@@ -6,7 +6,7 @@ use super::{aligned, episodes, percent, signed, with_interval};
 use crate::results::{Counts, Results, SettingResult, StepTime};
 use crate::statistics::Interval;
 
-/// All tables, one after the other. Every percentage has its interval or its number of episodes.
+/// All tables. Every percentage has its interval or its number of episodes.
 pub fn text(results: &Results) -> String {
     let parts = [
         averages(results),
@@ -20,7 +20,7 @@ pub fn text(results: &Results) -> String {
     parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
 }
 
-/// A title, the table below it, and what to see in it; nothing without rows.
+/// A title, the table and a note; nothing without rows.
 fn titled(title: &str, head: &[&str], rows: Vec<Vec<String>>, note: &str) -> String {
     if rows.is_empty() {
         return String::new();
@@ -46,12 +46,12 @@ fn averages(results: &Results) -> String {
         results.settings.iter().any(|one| one.all.success.episodes > one.all.success.starts);
     let note = match clustered {
         true => {
-            "  Episodes that share an initial layout are a cluster: the interval is as wide as that makes it."
+            "  Intervals account for clusters: episodes that share an initial layout are not independent."
         }
         false => "",
     };
     titled(
-        "Success in % of episodes, averaged over tasks, each of which counts the same; 95 % intervals",
+        "Success in % of episodes, averaged over tasks with equal weight; 95 % intervals",
         &["", "at the last step", "at any step", "released", "ever grasped", "episodes"],
         results.settings.iter().map(row).collect(),
         note,
@@ -99,7 +99,7 @@ fn gains(results: &Results) -> String {
         "Gains in percentage points, on the same initial layouts with the same random numbers",
         &["", "gain", "95 %", "pairs"],
         rows.collect(),
-        "  An interval that includes 0 leaves open which of the two is better.",
+        "  If an interval includes 0, it is not clear which of the two is better.",
     )
 }
 
@@ -117,12 +117,12 @@ fn headroom(results: &Results) -> String {
         "Headroom: share of the gap between a single sample and the oracle that a setting closes",
         &["", "share", "95 %", "episodes"],
         rows.collect(),
-        "  The oracle executes the candidate nearest to the scripted expert's action.\n  Open: the oracle may be no \
-         better than a single sample.",
+        "  The oracle executes the candidate nearest to the scripted expert's action.\n  \
+         Open: the oracle may be no better than a single sample.",
     )
 }
 
-/// Where a strategy ran with several numbers of candidates; a single sample is its first point.
+/// The strategies that ran with several numbers of candidates. A single sample is the first point of each.
 fn by_candidates(results: &Results) -> String {
     let mut rows = Vec::new();
     for strategy in Strategy::ALL {
@@ -169,12 +169,12 @@ fn counts(results: &Results) -> String {
         ]
     };
     titled(
-        "Beside the rates",
+        "Counts",
         &["", "malformed candidates", "held steps", "never acted", "faults", "repeats"],
         results.settings.iter().map(row).collect(),
-        "  Malformed candidates are never executed; without a well-formed one the robot holds still.\n  Episodes in which \
-         the policy never acted and attempts that broke (faults) have no outcome.\n  Repeats of an episode in which \
-         nothing is drawn count once.",
+        "  Malformed candidates are never executed; without a well-formed one the robot holds still.\n  \
+         Episodes in which the policy never acted and failed attempts (faults) have no outcome.\n  \
+         Repeats of an episode without sampling count once.",
     )
 }
 
@@ -183,7 +183,7 @@ fn times(results: &Results) -> String {
         results.batch_size.map_or_else(String::new, |size| format!(" (batches of {size:.0})"));
     let times = [
         (format!("  decision{batch}"), results.decision_ms),
-        ("  control step after it".to_owned(), results.step_ms),
+        ("  control step".to_owned(), results.step_ms),
         ("    of that, the simulator".to_owned(), results.simulator_ms),
     ];
     let rows = times.into_iter().filter_map(|(what, time)| {
