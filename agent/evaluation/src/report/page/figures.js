@@ -80,26 +80,34 @@ function addCopyButtons() {
 // One tooltip for all terms, inside the window wherever the term stands; Escape closes it.
 function addTips() {
   const tip = byId("tip");
-  const hide = () => (tip.hidden = true);
-  const show = (term) => {
-    tip.textContent = term.dataset.definition;
-    tip.hidden = false;
-    const at = term.getBoundingClientRect();
+  let shown = null;
+  const hide = () => {
+    tip.hidden = true;
+    shown?.removeAttribute("aria-describedby");
+    shown = null;
+  };
+  const place = () => {
+    if (shown === null) return;
+    const at = shown.getBoundingClientRect();
     const { width, height } = tip.getBoundingClientRect();
     const room = document.documentElement.clientWidth;
     tip.style.left = `${Math.max(8, Math.min(at.left, room - width - 8))}px`;
     tip.style.top = `${at.top > height + 12 ? at.top - height - 6 : at.bottom + 6}px`;
+  };
+  const show = (term) => {
+    hide();
+    shown = term;
+    tip.textContent = term.dataset.definition;
+    tip.hidden = false;
     term.setAttribute("aria-describedby", "tip");
+    place();
   };
   for (const term of document.querySelectorAll(".term")) {
-    term.addEventListener("mouseenter", () => show(term));
-    term.addEventListener("focus", () => show(term));
-    term.addEventListener("click", () => show(term));
-    term.addEventListener("mouseleave", hide);
-    term.addEventListener("blur", hide);
+    for (const event of ["mouseenter", "focus", "click"]) term.addEventListener(event, () => show(term));
+    for (const event of ["mouseleave", "blur"]) term.addEventListener(event, hide);
   }
   document.addEventListener("keydown", (event) => event.key === "Escape" && hide());
-  window.addEventListener("scroll", hide, { passive: true });
+  window.addEventListener("scroll", place, { passive: true });
 }
 
 // Scrolls to a section and moves the focus there.

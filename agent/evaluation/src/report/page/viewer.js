@@ -198,7 +198,8 @@ class Viewer {
     let last = performance.now();
     const tick = (now) => {
       if (!this.isPlaying) return;
-      this.clock += ((now - last) / 1000) * this.catalogue.frames_per_second * speed;
+      // A frame may have begun before the play button was pressed.
+      this.clock += (Math.max(0, now - last) / 1000) * this.catalogue.frames_per_second * speed;
       last = now;
       if (this.clock >= this.stepsMax) return this.ended();
       const step = Math.floor(this.clock);
