@@ -183,7 +183,7 @@ def test_keys_choose_parts_of_the_observation(caplog: pytest.LogCaptureFixture) 
 def test_keys_that_are_not_there_are_refused(keys: Keys, words: str) -> None:
     with pytest.raises(InvalidReset, match=words):
         cup(keys)
-    with pytest.raises(InvalidReset, match="expected one of none: the observation has no such"):
+    with pytest.raises(InvalidReset, match="expected one of none .the observation has no such"):
         offered(["CartPole-v1"], [], Making(), 50, Keys(image="front"))
 
 
@@ -195,8 +195,8 @@ def test_a_sound_environment_gives_no_warning() -> None:
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("instance", "other observations in another instance: episodes cannot be repeated"),
-        ("episode", "other observations in the next episode: episodes cannot be repeated"),
+        ("instance", "different observations in another instance: episodes are not reproducible"),
+        ("episode", "different observations in the next episode: episodes are not reproducible"),
         ("step", "a reset and 5 random steps fail: RuntimeError: out of memory"),
     ],
 )

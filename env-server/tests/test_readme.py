@@ -48,4 +48,6 @@ def test_the_example_moves_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
         exec(EXAMPLES[0].values[0], names)  # type: ignore[arg-type]
     assert names["truncated"]
     path = np.linalg.norm(np.diff(np.array(positions), axis=0), axis=1)
-    assert len(positions) == 60 and path.sum() > 0.3  # metres
+    # Metres; 40 episodes of random actions moved the gripper by 0.25 to 1.9. An arm whose commanded
+    # pose is out of reach at once holds still.
+    assert len(positions) == 60 and path.sum() > 0.1

@@ -101,7 +101,7 @@ def test_a_server_that_cannot_draw_says_so_before_it_is_ready(tmp_path: Path) ->
     with open(hidden, "w", encoding="utf-8") as file:
         file.write('{"file_format_version": "1.0.0", "ICD": {"library_path": "libEGL_mesa_no.so"}}')
     with served({"__EGL_VENDOR_LIBRARY_FILENAMES": hidden}) as (endpoint, lines):
-        warning = "images cannot be rendered, sessions with images are refused: none of 0 EGL"
+        warning = "cannot render images; sessions with images are refused: none of 0 EGL"
         assert any(warning in line and hidden in line for line in lines), lines
         with pytest.raises(RemoteRefused, match="expected an offscreen OpenGL context"):
             RemoteEnv(endpoint, image_height=48, image_width=64).reset(seed=0)

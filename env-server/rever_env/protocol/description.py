@@ -25,7 +25,7 @@ class Dimension:
         value.finite(field, bounds)
         is_whole = len(bounds) == 2 and all(bound.is_integer() for bound in bounds)
         if self.discrete and not is_whole:
-            raise ValueError(f"{field}: expected whole bounds, because it is discrete")
+            raise ValueError(f"{field}: expected whole bounds, for it is discrete")
         if len(bounds) == 2 and bounds[0] > bounds[1]:
             raise ValueError(f"{field}: expected low <= high, got {bounds[0]:g} and {bounds[1]:g}")
 
