@@ -97,10 +97,11 @@ impl Workplace {
     /// Runs a line of a document as a shell would.
     fn shell(&self, line: &str) -> Output {
         let environment = python();
-        let path = std::env::var("PATH").expect("there is a PATH");
+        let inherited = std::env::vars_os().find(|(name, _)| name == "PATH");
+        let (_, path) = inherited.expect("there is a PATH");
         let mut shell = Command::new("sh");
         shell.env_clear().envs(&environment.variables).env("PYTHON", &environment.python);
-        shell.env("PATH", format!("{}:{path}", self.path("bin").display()));
+        shell.env("PATH", format!("{}:{}", self.path("bin").display(), path.to_string_lossy()));
         shell.env("HOME", self.path("home")).current_dir(self.folder.path());
         run(shell.args(["-c", line]).stdin(Stdio::null()))
     }

@@ -183,7 +183,7 @@ def test_keys_choose_parts_of_the_observation(caplog: pytest.LogCaptureFixture) 
 def test_keys_that_are_not_there_are_refused(keys: Keys, words: str) -> None:
     with pytest.raises(InvalidReset, match=words):
         cup(keys)
-    with pytest.raises(InvalidReset, match="expected one of none .the observation has no such"):
+    with pytest.raises(InvalidReset, match=r"expected one of none .the observation has no such"):
         offered(["CartPole-v1"], [], Making(), 50, Keys(image="front"))
 
 
