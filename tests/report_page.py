@@ -254,6 +254,28 @@ def filters_searches_and_sorts(report: Report) -> None:
         assert rows.first.get_attribute("data-key") == str(best)
 
 
+def shows_one_setting_alone(report: Report) -> None:
+    with report.page() as page:
+        page.select_option("#right select", "")
+        wait_for(page, "document.querySelector('#right').hidden")
+        assert (
+            page.inner_text("#verdict") == ""
+            and page.locator("#cards .card").count() == 5
+        )
+        assert "with=" not in page.url
+        left = report.catalogue["compared"][0]
+        outcomes = [
+            e["outcome"]
+            for p in report.catalogue["pairs"]
+            for e in p["episodes"]
+            if e["setting"] == left
+        ]
+        page.select_option("#filter-result", "outcome-success")
+        assert page.locator("#rows .row").count() == outcomes.count("success")
+        page.click("#beside")
+        wait_for(page, "!document.querySelector('#right').hidden")
+
+
 def everything_works_by_keyboard(report: Report) -> None:
     with report.page() as page:
         page.keyboard.press(" ")
@@ -414,6 +436,7 @@ CHECKS: list[Callable[[Report], None]] = [
     plays_both_videos_together,
     steps_through_candidates,
     filters_searches_and_sorts,
+    shows_one_setting_alone,
     everything_works_by_keyboard,
     links_lead_to_an_episode_and_a_step,
     has_no_serious_barrier,
