@@ -35,6 +35,15 @@ fn the_page_of_a_run_works_in_a_browser() {
     succeed(rever().arg("report").arg(evaluation.run_folder()).arg("--out").arg(&report));
     assert_eq!(files(&evaluation.run_folder()), before, "a run may be read-only for its reader");
 
+    // One video is made again from its record, in which the simulator has to do the same once more.
+    let videos = evaluation.run_folder().join("videos");
+    let video = videos.read_dir().expect("videos").next().expect("a video").expect("a file").path();
+    std::fs::remove_file(&video).expect("it can be removed");
+    let mut again = rever();
+    again.arg("report").arg(evaluation.run_folder()).arg("--out").arg(&report);
+    let said = succeed(again.args(["--video", "--python"]).arg(&python().python));
+    assert!(said.contains("videos rendered: 1") && video.is_file(), "{said}");
+
     // Left for a look afterwards.
     let screenshots = folder.join("screenshots");
     let mut browser = python().command();

@@ -11,8 +11,8 @@ import statistics
 import tempfile
 from pathlib import Path
 
+from browser import BROWSER_ARGUMENTS, find_browser
 from playwright.sync_api import Page, sync_playwright
-from report_page import BROWSER_ARGUMENTS, find_browser
 
 BEFORE, AFTER = "window.reverCatalogue = ", ";\n"
 REPEATS = 5

@@ -68,7 +68,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             installation: installation(host)?,
         };
         let made = videos::render(&arguments.run, local, arguments.episodes_max)?;
-        println!("rendered {made} videos");
+        println!("videos rendered: {made}");
     }
     let options =
         ReportOptions { run: &arguments.run, out: &out, episodes_max: arguments.episodes_max };

@@ -206,9 +206,11 @@ fn opening(pairs: &[Pair], (first, second): (usize, Option<usize>)) -> usize {
         let (ours, theirs) = (of(first), second.and_then(of));
         let succeeds = |entry: Option<&Entry>| entry.is_some_and(|one| one.outcome == "success");
         let is_won = succeeds(ours) && !succeeds(theirs) && theirs.is_some();
+        // One that succeeded and lost it again shows less of a difference.
+        let is_clear = is_won && theirs.is_some_and(|one| one.outcome != "lost");
         let videos = [ours, theirs].into_iter().flatten().filter(|entry| entry.video).count();
         let is_whole = ours.is_some() && (theirs.is_some() || second.is_none());
-        (is_won, videos, is_whole, succeeds(ours), std::cmp::Reverse(*index))
+        (is_won, videos, is_clear, is_whole, succeeds(ours), std::cmp::Reverse(*index))
     };
     pairs.iter().enumerate().max_by_key(rank).map_or(0, |(index, _)| index)
 }
