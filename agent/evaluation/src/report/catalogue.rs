@@ -80,6 +80,14 @@ fn is_false(flag: &bool) -> bool {
     !*flag
 }
 
+/// A fixed layout by its number, a random one by the number of its episode.
+fn layout_name(identity: &EpisodeIdentity) -> String {
+    match identity.layout {
+        Some(layout) => format!("layout {layout}"),
+        None => format!("random {}", identity.episode),
+    }
+}
+
 impl Catalogue {
     /// Lists all episodes, task by task in the order of the results. At most `details_max` of them come with their steps.
     pub fn new(
@@ -97,10 +105,7 @@ impl Catalogue {
             let task = results.tasks.iter().position(|task| *task == id).unwrap_or_default();
             let pair = pairs.entry((task, identity.episode)).or_insert_with(|| Pair {
                 task,
-                layout: match identity.layout {
-                    Some(layout) => format!("layout {layout}"),
-                    None => format!("random {}", identity.episode),
-                },
+                layout: layout_name(identity),
                 episodes: Vec::new(),
             });
             pair.episodes.push(entry);
