@@ -35,8 +35,9 @@ impl Milestones {
             // The first candidate is the one that a single sample executes: another one is a choice that differs.
             Some((decision.chosen? > 0, lead(decision)?, index))
         });
-        let leads = leads.filter(|(_, lead, _)| *lead > 0.0);
-        let clearest = leads.max_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        let clearest = leads
+            .filter(|(_, lead, _)| *lead > 0.0)
+            .max_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
         Milestones {
             grasp: first(&|statistics| statistics.is_grasped),
             success,
