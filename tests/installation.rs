@@ -197,7 +197,10 @@ fn a_named_python_that_cannot_run_servers_is_refused_with_a_hint() {
     for (named, expected) in [
         (bare, "lacks mujoco, numpy, gymnasium, zenoh, msgpack: leave --python out"),
         ("/bin/false".into(), "expected a Python, got a program with exit status: 1"),
-        ("/nowhere/python".into(), "expected a Python: No such file or directory"),
+        (
+            "/nowhere/python".into(),
+            "cannot run it as a Python interpreter: No such file or directory",
+        ),
     ] {
         let output = run(copied.command().args(["doctor", "--python"]).arg(&named));
         let said = text(&output);

@@ -251,11 +251,7 @@ fn the_native_server_reports_wrong_usage_in_one_line() {
         (&[][..], 2, "--connect <ENDPOINT>|--listen <ENDPOINT>|--multicast"),
         (&["--listen", &free, "--fleet", "../x"], 2, "invalid fleet name"),
         (&["--listen", &free, "--sessions", "0"], 2, "0 is not in 1..=256"),
-        (
-            &["--listen", &free, "--id-file", "/nowhere/id"],
-            1,
-            "expected it in a folder that exists",
-        ),
+        (&["--listen", &free, "--id-file", "/nowhere/id"], 1, "its folder does not exist"),
         (&["--listen", &taken], 1, "Address already in use"),
     ] {
         let output = run(native().command().arg("serve").args(arguments));

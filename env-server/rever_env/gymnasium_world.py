@@ -160,7 +160,7 @@ class GymnasiumWorld:
 
     def _running(self) -> int:
         if self._start is None:
-            raise InvalidAction("step or save before reset: expected a reset world")
+            raise InvalidAction("step or save before reset: call reset first")
         return self._start
 
     def _numbers(self) -> NDArray[np.float32]:

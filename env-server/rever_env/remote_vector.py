@@ -140,7 +140,9 @@ class RemoteVectorEnv(VectorEnv[Fields, NDArray[np.float32], NDArray[Any]]):
         is_manual = self.autoreset_mode == AutoresetMode.DISABLED
         if is_manual and self._ended.any():
             ended = _indices(self._ended)
-            raise ValueError(f"environments {ended} have ended: expected reset with a reset_mask")
+            raise ValueError(
+                f"environments {ended} have ended: call reset(options={{'reset_mask': mask}}) first"
+            )
         begins = _indices(self._ended | self._lost) if not is_manual else []
         steps = _indices(~(self._ended | self._lost))
         rows = list(iterate(self.action_space, actions))

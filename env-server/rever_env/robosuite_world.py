@@ -196,7 +196,7 @@ class RobosuiteWorld:
 
     def _running(self) -> int:
         if self._steps is None:
-            raise InvalidAction("step or save before reset: expected a reset world")
+            raise InvalidAction("step or save before reset: call reset first")
         return self._steps
 
     def _parts(self) -> list[Any]:

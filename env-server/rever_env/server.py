@@ -235,9 +235,12 @@ class Server:
                 if lease.holder == "gone" or now - lease.closed_at > _CLOSED_SECS_MAX:
                     self._end(lease, None)
             elif lease.holder == "gone" and now - lease.gone_at > _HOLDER_SECS_MAX:
-                self._end(lease, f"its holder has been gone for {_HOLDER_SECS_MAX:.0f} s")
+                self._end(lease, f"its client has been gone for {_HOLDER_SECS_MAX:.0f} s")
             elif lease.holder == "awaited" and now - lease.opened_at > _HOLDER_SECS_MAX:
-                self._end(lease, f"expected its holder's token within {_HOLDER_SECS_MAX:.0f} s")
+                self._end(
+                    lease,
+                    f"its client's liveliness token did not appear within {_HOLDER_SECS_MAX:.0f} s",
+                )
 
     def _end(self, lease: _Lease, reason: str | None) -> None:
         del self._leases[lease.name]

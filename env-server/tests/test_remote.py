@@ -234,7 +234,7 @@ def test_a_session_that_the_server_ended_says_why_and_reset_opens_another(endpoi
     remote.reset(seed=1)
     remote.session._network._declared.pop().undeclare()  # the holder's token
     ends_at = time.monotonic() + 30.0
-    with pytest.raises(RemoteFault, match="ended: its holder has been gone for 10 s"):
+    with pytest.raises(RemoteFault, match="ended: its client has been gone for 10 s"):
         while time.monotonic() < ends_at:
             remote.session.ask(lambda sequence: protocol.Save(sequence, 0))
     with pytest.raises(RemoteFault, match="the session is lost; reset opens a new one"):

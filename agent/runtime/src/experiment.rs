@@ -309,7 +309,10 @@ fn names<'a>(tasks: impl Iterator<Item = &'a TaskId>) -> String {
 pub async fn default_tasks(deployment: &Deployment) -> Result<Vec<OfferedTask>> {
     let mut tasks = tasks_of(&deployment.first_servers().await?);
     tasks.retain(|task| task.id.variant == VARIANT_DEFAULT);
-    ensure!(!tasks.is_empty(), "tasks: expected --tasks, for no server offers a default variant");
+    ensure!(
+        !tasks.is_empty(),
+        "--tasks: expected TASK/VARIANT, because no server offers a default variant; `rever list variants` lists them"
+    );
     Ok(tasks)
 }
 

@@ -100,7 +100,10 @@ impl LabelStore {
 /// All labels of a store, ordered by run and name. Opens the store read-only.
 pub fn labels(path: &Path) -> Result<Vec<Label>> {
     let name = path.display();
-    ensure!(path.is_file(), "label store {name}: expected a file, got none");
+    ensure!(
+        path.is_file(),
+        "label store {name} does not exist; run `rever collect` first, or name runs or --labels"
+    );
     let connection = Connection::open_with_flags(path, OpenFlags::SQLITE_OPEN_READ_ONLY)
         .with_context(|| format!("cannot open the label store {name}"))?;
     connection.busy_timeout(WAIT)?;
@@ -348,7 +351,12 @@ mod tests {
         check(&text, "is not a label store");
         let missing = folder.path().join("none.sqlite");
         let error = labels(&missing).expect_err("none").to_string();
-        assert!(error.ends_with("none.sqlite: expected a file, got none"), "{error}");
+        assert!(
+            error.ends_with(
+                "none.sqlite does not exist; run `rever collect` first, or name runs or --labels"
+            ),
+            "{error}"
+        );
         assert!(!missing.exists(), "reading makes none");
     }
 

@@ -294,12 +294,13 @@ impl<'a> Server<'a> {
             } else if let Holder::Gone(gone_at) = holder {
                 if since(gone_at) > HOLDER_WAIT_MAX {
                     let seconds = HOLDER_WAIT_MAX.as_secs();
-                    let reason = format!("its holder has been gone for {seconds} s");
+                    let reason = format!("its client has been gone for {seconds} s");
                     ended.push((name.clone(), Some(reason)));
                 }
             } else if holder == Holder::Awaited && since(lease.opened_at) > HOLDER_WAIT_MAX {
                 let seconds = HOLDER_WAIT_MAX.as_secs();
-                let reason = format!("expected its holder's token within {seconds} s");
+                let reason =
+                    format!("its client's liveliness token did not appear within {seconds} s");
                 ended.push((name.clone(), Some(reason)));
             }
         }

@@ -77,7 +77,7 @@ pub fn serve(arguments: Arguments, tasks: Vec<Task>) -> Result<()> {
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
         ensure!(
             folder.is_none_or(Path::is_dir),
-            "--id-file {}: expected it in a folder that exists",
+            "--id-file {}: its folder does not exist",
             path.display()
         );
     }

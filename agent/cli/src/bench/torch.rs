@@ -70,7 +70,10 @@ impl Torch {
                 script.display()
             )
         })?;
-        ensure!(!hello.settings.is_empty(), "PyTorch: expected a setting that works, got none");
+        ensure!(
+            !hello.settings.is_empty(),
+            "--compare: PyTorch could not run the policy in any setting"
+        );
         let torch = Torch { process, requests, replies, hello };
         torch.signal(libc::SIGSTOP)?;
         Ok(torch)

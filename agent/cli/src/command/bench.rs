@@ -46,7 +46,7 @@ struct DecisionArguments {
     /// File of the verifier [default: verifier.safetensors in the policy's folder]
     #[arg(long)]
     verifier: Option<PathBuf>,
-    /// File of recorded observations: images and instructions [default: eight in the shipped policy's image size]
+    /// File of recorded observations: images and instructions [default: eight built-in ones, of the included policy's image size]
     #[arg(long, value_name = "FILE")]
     observations: Option<PathBuf>,
     /// Number of passes over all observations
@@ -88,7 +88,7 @@ struct ThroughputArguments {
     /// Device that the policy runs on: cpu, cuda or cuda:N
     #[arg(long, default_value_t)]
     device: DeviceName,
-    /// Python for the servers, with the packages of env-server [default: an environment that rever sets up]
+    /// Python interpreter for the servers, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
     /// Also write the figures to this file
@@ -96,7 +96,7 @@ struct ThroughputArguments {
     json: Option<PathBuf>,
 }
 
-/// Measure the wire's share of a control step: its time minus the simulator's
+/// Measure the network's share of a control step: its time minus the simulator's
 #[derive(Debug, Args)]
 struct WireArguments {
     /// Numbers of concurrent sessions on one server, separated by commas
@@ -130,7 +130,7 @@ struct StepsArguments {
     /// Height and width of the image
     #[arg(long, default_value_t = 224, value_parser = clap::value_parser!(u32).range(1..=1024))]
     side: u32,
-    /// Python for the servers, with the packages of env-server [default: an environment that rever sets up]
+    /// Python interpreter for the servers, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
     /// Also write the figures to this file

@@ -27,7 +27,7 @@ pub struct Arguments {
     /// Id of the server to test, if there are several [default: the first]
     #[arg(long)]
     id: Option<String>,
-    /// Python for the server, with the packages of env-server [default: an environment that rever sets up]
+    /// Python interpreter for the server, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
     /// Also write the results to this file

@@ -27,7 +27,7 @@ pub struct Arguments {
     /// Random initial layouts per task; each is run with a single sample and with the verifier
     #[arg(long, default_value_t = 6, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..))]
     episodes: u32,
-    /// Seed of the suite; it determines initial layouts and samples
+    /// Random seed of initial layouts and samples
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Folder of the run; rerun the same command to resume it [default: a folder under runs/]
@@ -36,7 +36,7 @@ pub struct Arguments {
     /// Also write the results to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
-    /// Python for the servers, with the packages of env-server [default: an environment that rever sets up]
+    /// Python interpreter for the servers, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long)]
     python: Option<PathBuf>,
 }

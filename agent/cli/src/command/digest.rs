@@ -10,7 +10,7 @@ use store::{combined_digest, episode_digest, hex};
 
 /// Print a digest of the episodes of a run
 ///
-/// SHA-256 over identities, candidates' tokens, choices, statistics and states. Runs of the same suite have the same
+/// SHA-256 over episode identities, candidate tokens, choices, statistics and states. Runs of the same suite have the same
 /// digest on every machine: the number of servers, the order of episodes and interruptions do not change it.
 #[derive(Debug, Args)]
 pub struct Arguments {

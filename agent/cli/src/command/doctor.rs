@@ -43,7 +43,7 @@ pub struct Arguments {
     /// Namespace: peers see each other only within the same fleet
     #[arg(long, default_value = FLEET_DEFAULT, value_parser = fleet)]
     fleet: String,
-    /// Python for the server, with the packages of env-server [default: an environment that rever sets up]
+    /// Python interpreter for the server, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
     /// Also write the findings to this file

@@ -41,7 +41,7 @@ pub struct EpisodesArguments {
     /// `rever list tasks` [default: all tasks of the servers, in their default variant]
     #[arg(long, value_delimiter = ',', value_parser = task)]
     pub tasks: Vec<TaskId>,
-    /// Seed of the suite; it determines initial layouts and samples
+    /// Random seed of initial layouts and samples
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
     /// Folder of the checkpoint [default: the policy that comes with rever]
@@ -53,7 +53,7 @@ pub struct EpisodesArguments {
     /// File of the verifier [default: verifier.safetensors in the policy's folder, if it exists]
     #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
     pub verifier: Option<PathBuf>,
-    /// Follow a published verifier: switch to its newest version between episodes
+    /// Use the verifier that `rever train --name NAME` publishes; switch to its newest version between episodes
     #[arg(long, value_name = "NAME", value_parser = names::verifier, help_heading = "Policy and verifier")]
     pub follow_verifier: Option<String>,
     /// Server processes to start on this machine [default: 2]
@@ -62,7 +62,7 @@ pub struct EpisodesArguments {
     /// Simulator of these servers
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect", help_heading = "Servers")]
     pub simulator: Simulator,
-    /// Use running servers: HOST:PORT of servers or of a router, separated by commas
+    /// Use running servers: HOST:PORT of servers or of a zenoh router, separated by commas
     #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', value_parser = endpoint, help_heading = "Servers")]
     pub connect: Vec<String>,
     /// Listen on HOST:PORT for peers, such as a trainer that publishes verifiers [default: a local socket]
@@ -74,7 +74,7 @@ pub struct EpisodesArguments {
     /// Number of concurrent episodes
     #[arg(long, default_value_t = SESSIONS_DEFAULT, value_parser = clap::value_parser!(u16).range(1..=256), help_heading = "Servers")]
     pub sessions: u16,
-    /// Python for the servers, with the packages of env-server [default: an environment that rever sets up]
+    /// Python interpreter for the servers, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE", help_heading = "Servers")]
     pub python: Option<PathBuf>,
     /// Folder of the run; rerun the same command to resume it [default: a folder under runs/]
@@ -86,7 +86,7 @@ pub struct EpisodesArguments {
     /// Record a video of every episode
     #[arg(long, help_heading = "Files")]
     pub video: bool,
-    /// Record the hidden states of all candidates, not only of the executed ones
+    /// Record the hidden states of all candidates, not only of the executed one; always on in `collect --strategy sample`
     #[arg(long, help_heading = "Files")]
     pub all_hidden: bool,
 }

@@ -37,7 +37,7 @@ pub struct Arguments {
     /// Episodes per task and setting; 24 cover each of SIMPLER's layouts once
     #[arg(long, default_value_t = 24, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..))]
     episodes: u32,
-    /// Initial layouts: the fixed ones of each task, or random ones from the held-out range of seeds
+    /// Initial layouts: the fixed ones of each task, or random ones from seeds that `collect` never uses
     #[arg(long, value_enum, default_value = "grid")]
     layouts: Layouts,
     #[command(flatten)]
@@ -88,6 +88,6 @@ pub fn temperature(text: &str) -> Result<f32, String> {
     if temperature.is_finite() && temperature >= 0.0 {
         Ok(temperature)
     } else {
-        Err(format!("expected 0 or more, got {text}"))
+        Err(format!("expected a finite number of at least 0, got {text}"))
     }
 }

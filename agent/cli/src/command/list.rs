@@ -40,7 +40,7 @@ enum What {
     },
     /// List the servers found at an address
     Servers {
-        /// HOST:PORT of servers or of a router, separated by commas
+        /// HOST:PORT of servers or of a zenoh router, separated by commas
         #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', required = true, value_parser = endpoint)]
         connect: Vec<String>,
         /// Namespace: peers see each other only within the same fleet
@@ -52,7 +52,7 @@ enum What {
 /// The servers that describe the tasks.
 #[derive(Debug, Args)]
 struct ServerArguments {
-    /// Ask running servers: HOST:PORT of servers or of a router, separated by commas [default: start a server]
+    /// Ask running servers: HOST:PORT of servers or of a zenoh router, separated by commas [default: start a server]
     #[arg(long, value_name = "HOST:PORT", value_delimiter = ',', value_parser = endpoint)]
     connect: Vec<String>,
     /// Namespace: peers see each other only within the same fleet
@@ -61,7 +61,7 @@ struct ServerArguments {
     /// Simulator to start
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
     simulator: Simulator,
-    /// Python for the server, with the packages of env-server [default: an environment that rever sets up]
+    /// Python interpreter for the server, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
 }

@@ -66,7 +66,7 @@ impl TypedValueParser for StrategyParser {
 pub fn strategy_meaning(strategy: Strategy) -> &'static str {
     match strategy {
         Strategy::Greedy => "the most likely token at every position; one candidate",
-        Strategy::Sample => "one sampled candidate: the baseline",
+        Strategy::Sample => "the first sampled candidate: the baseline",
         Strategy::FirstWellFormed => "the first of N candidates that holds a valid action",
         Strategy::Majority => "the action that most candidates agree with (self-consistency)",
         Strategy::Medoid => "the candidate nearest to all others",

@@ -34,18 +34,18 @@ pub struct Arguments {
     /// [default: the one that comes with rever]
     #[arg(long)]
     policy: Option<PathBuf>,
-    /// The verifier that scored; the page shows the terms of its scores
+    /// Verifier that scored the run, to show the terms of its scores
     /// [default: verifier.safetensors in the policy's folder]
     #[arg(long, value_name = "FILE")]
     verifier: Option<PathBuf>,
-    /// Episodes whose steps are written; those with videos come first
+    /// Maximum number of episodes whose steps are shown; those with videos come first
     #[arg(long, default_value_t = EPISODES_MAX)]
     episodes_max: usize,
-    /// Render the episodes that have no video, from their records, into the run's folder; takes about as long as the
+    /// Replay recorded episodes that have no video and save their videos in the run's folder; takes about as long as the
     /// simulator needs for their steps
     #[arg(long)]
     video: bool,
-    /// The simulator that renders: the one that the run was made with
+    /// Simulator for --video, which must be the one that the run was made with
     #[arg(long, value_enum, default_value_t, requires = "video")]
     simulator: Simulator,
     /// A Python that has the packages of env-server, instead of the one that rever sets up
@@ -97,7 +97,7 @@ fn build_with(
     let (expected, found) = (header.versions["policy"].as_str(), parser.digest());
     ensure!(
         expected == Some(found),
-        "policy: the run was made with {}, got {found}; tokens mean nothing to another policy (--policy)",
+        "policy: the run was made with {}, got {found}; only its tokenizer can decode the tokens of the run (--policy)",
         expected.unwrap_or("an unknown one")
     );
     let speak = |tokens: &[u32]| Speech {

@@ -32,9 +32,9 @@ const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
   rever train runs/collect-1a2b3c4d --out mine.safetensors
   rever train --policy FOLDER --out FOLDER/verifier.safetensors      as the policy's default verifier")]
 pub struct Arguments {
-    /// Runs to train on; every episode in them must be eligible [default: the label store]
+    /// Folders of runs to train on; an episode that cannot be used (evaluation layout, strategy other than sample, other policy) is an error [default: the label store]
     runs: Vec<PathBuf>,
-    /// Label store to train on; episodes that are not eligible are excluded and counted
+    /// Label store to train on; episodes that cannot be used are skipped and counted
     #[arg(long, default_value = "runs/labels.sqlite", conflicts_with = "runs")]
     labels: PathBuf,
     /// Folder of the policy that collected the episodes [default: the policy that comes with rever]
@@ -64,7 +64,7 @@ pub struct Arguments {
     /// Share of each task's initial layouts held out for the printed metrics
     #[arg(long, default_value_t = TrainingOptions::default().held_out_share)]
     held_out_share: f64,
-    /// Factor on the weights of the distance to the predicted target; 0 disables the target
+    /// Multiplier of the ranking weights for the gripper's distance to its predicted target position; 0 disables them
     #[arg(long, default_value_t = TrainingOptions::default().target_factor)]
     target_factor: f64,
     /// Train the paper's verifier, without the ranking of candidates

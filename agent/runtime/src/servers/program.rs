@@ -15,12 +15,12 @@ use super::python::PythonEnvironment;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Simulator {
-    /// `python -m rever_env serve`.
+    /// MuJoCo from Python (`python -m rever_env serve`).
     #[default]
     Python,
-    /// `rever-simulator`, built on first use.
+    /// MuJoCo from Rust (`rever-simulator`), equal to python bit for bit; a checkout builds it on first use.
     Native,
-    /// The Bridge tasks in robosuite with its controllers; it has its own Python packages.
+    /// The Bridge tasks in robosuite with its controllers; rever sets up the packages on first use.
     Robosuite,
 }
 

@@ -144,7 +144,8 @@ pub fn named_environment(
     let modules = SERVERS_MODULES.iter().chain(is_robosuite.then_some(&ROBOSUITE_MODULE));
     let name = python.display();
     let output = environment.command().args(["-c", LACKING_MODULES]).args(modules).output();
-    let output = output.with_context(|| format!("--python {name}: expected a Python"))?;
+    let output = output
+        .with_context(|| format!("--python {name}: cannot run it as a Python interpreter"))?;
     let said = String::from_utf8_lossy(&output.stdout);
     let mut lines = said.lines();
     let version =
@@ -168,7 +169,7 @@ pub fn named_environment(
     };
     ensure!(
         lacking.is_empty(),
-        "--python {name}: {version} lacks {lacking}: {install}leave --python out, and rever sets up a Python \
+        "--python {name}: {version} lacks {lacking}; {install}omit --python and rever sets up a Python \
          environment of its own"
     );
     Ok(environment)

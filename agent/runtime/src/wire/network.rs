@@ -250,7 +250,7 @@ async fn open_session(
                 return Err(match &options.connect[..] {
                     [] => anyhow!("cannot listen on {}: {reason}", listening.join(", ")),
                     connect => anyhow!(
-                        "cannot connect to {}: what listens there does not answer as zenoh does ({reason})",
+                        "cannot connect to {}: the program that listens there does not speak zenoh ({reason})",
                         connect.join(", ")
                     ),
                 });
@@ -280,7 +280,7 @@ fn configuration(options: &NetworkOptions, listening: &[String]) -> anyhow::Resu
         transport::settings(connect, listening, *multicast, CLIENT_WAIT_MS, bytes_max)
     {
         configuration.insert_json5(key, &value).map_err(|error| {
-            anyhow!("zenoh does not take {key} = {value}: {}", transport::in_words(error))
+            anyhow!("zenoh rejects the setting {key} = {value}: {}", transport::in_words(error))
         })?;
     }
     Ok(configuration)

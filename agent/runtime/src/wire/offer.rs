@@ -18,7 +18,7 @@ pub fn difference(first: &TaskDescription, offer: &TaskDescription) -> Option<St
         .zip(texts(offer))
         .map(|((name, expected), (_, got))| (name, expected, got))
         .find(|(_, expected, got)| expected != got)?;
-    Some(format!("expected {name} of the run's other episodes ({expected}), got {got}"))
+    Some(format!("{name} differs from the run's other episodes: expected {expected}, got {got}"))
 }
 
 /// The properties of a task that must be equal on all servers of a run.
@@ -57,12 +57,12 @@ mod tests {
         assert_eq!(difference(&first, &first), None);
         let longer = TaskDescription { steps_max: first.steps_max + 7, ..first.clone() };
         let (expected, got) = (first.steps_max, longer.steps_max);
-        let text =
-            format!("expected the horizon of the run's other episodes ({expected}), got {got}");
+        let text = format!(
+            "the horizon differs from the run's other episodes: expected {expected}, got {got}"
+        );
         assert_eq!(difference(&first, &longer), Some(text));
         let renamed = TaskDescription { instruction: "stack them".to_owned(), ..first.clone() };
-        let text =
-            "expected the instruction of the run's other episodes (\"stack\"), got \"stack them\"";
+        let text = "the instruction differs from the run's other episodes: expected \"stack\", got \"stack them\"";
         assert_eq!(difference(&first, &renamed).as_deref(), Some(text));
     }
 }

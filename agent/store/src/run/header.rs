@@ -161,7 +161,7 @@ fn unique_name(folder: &Path) -> String {
 /// Reports the first difference. Results of different options must not be mixed in one table.
 fn ensure_same(what: &str, existing: &Value, asked: &Value) -> Result<()> {
     let (Value::Object(existing), Value::Object(asked)) = (existing, asked) else {
-        bail!("{what}s: expected names and values, got {existing} and {asked}");
+        bail!("{what}s: expected JSON objects, got {existing} (recorded) and {asked} (requested)");
     };
     let names: BTreeSet<&String> = existing.keys().chain(asked.keys()).collect();
     for name in names.into_iter().filter(|name| !GROWING.contains(&name.as_str())) {

@@ -57,7 +57,7 @@ impl fmt::Display for ExclusionReason {
             }
             ExclusionReason::Selected(strategy) => write!(
                 formatter,
-                "expected candidates that were sampled, not selected (strategy {}), got strategy {strategy}",
+                "expected an episode of strategy {}, got {strategy}; `rever collect` records them",
                 Strategy::Sample
             ),
             ExclusionReason::Policy(policy) => write!(

@@ -173,7 +173,7 @@ impl Config {
         let vocabulary = file.text_config.vocab_size.saturating_sub(file.pad_to_multiple_of);
         ensure!(
             file.n_action_bins == 256 && vocabulary > 256,
-            "n_action_bins: expected 256 in a vocabulary of more than 256 tokens ({vocabulary}), got {}",
+            "n_action_bins: expected 256 and a vocabulary of more than 256 tokens, got {} and {vocabulary}",
             file.n_action_bins
         );
         let limit = if file.reasoning { REASONING_TOKENS_MAX } else { ACTION_LENGTH + 1 };
@@ -211,7 +211,7 @@ impl File {
                 (Some(_), Some(_)) => {
                     bail!("vision_config: expected none, because {id} is a known tower")
                 }
-                (None, None) => bail!("timm_model_ids: {id} is unknown and has no vision_config"),
+                (None, None) => bail!("timm_model_ids: expected a known tower or one described in vision_config, got {id}"),
             }
         });
         let towers: Vec<TowerConfig> = towers.collect::<Result<_>>()?;

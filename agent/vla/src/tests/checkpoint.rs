@@ -195,7 +195,7 @@ fn unknown_layouts_are_refused_with_a_reason() {
     );
     check(
         |c| c["vision_config"] = serde_json::Value::Null,
-        "timm_model_ids: rever_vit is unknown and has no vision_config",
+        "timm_model_ids: expected a known tower or one described in vision_config, got rever_vit",
     );
     check(
         |c| c["vision_config"]["window"] = 7.into(),

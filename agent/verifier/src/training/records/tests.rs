@@ -205,7 +205,7 @@ fn hidden_states_of_selected_candidates_are_not_used() {
         assert_eq!(
             read(&record).expect_err("selected").to_string(),
             format!(
-                "expected candidates that were sampled, not selected (strategy sample), got strategy {strategy}"
+                "expected an episode of strategy sample, got {strategy}; `rever collect` records them"
             )
         );
     }
@@ -285,5 +285,10 @@ fn a_label_store_counts_what_is_excluded_by_its_reason() {
     std::fs::remove_file(file(&records[0])).expect("it is there");
     assert_eq!(from_labels(&path).expect("a whole store").1["record is missing"], 1);
     let missing = from_labels(&folder.path().join("none.sqlite")).expect_err("no store");
-    assert!(missing.to_string().ends_with("none.sqlite: expected a file, got none"), "{missing}");
+    assert!(
+        missing.to_string().ends_with(
+            "none.sqlite does not exist; run `rever collect` first, or name runs or --labels"
+        ),
+        "{missing}"
+    );
 }
