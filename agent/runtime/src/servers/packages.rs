@@ -237,15 +237,13 @@ impl PackageList<'_> {
 /// Says plainly that the network is missing, in place of what the installer printed for each of its attempts.
 fn explain_network(error: Error) -> Error {
     let said = format!("{error:#}");
-    let Some(line) = said.lines().find(|line| NETWORK_WORDS.iter().any(|word| line.contains(word)))
-    else {
-        return error;
-    };
+    let mut found = said.lines().filter_map(|line| {
+        NETWORK_WORDS.iter().find_map(|word| line.find(word).map(|start| line[start..].trim_end()))
+    });
+    let Some(cause) = found.next() else { return error };
     anyhow!(
         "cannot reach a package index: is this machine offline? The first start downloads Python packages (HTTPS_PROXY \
-         names a proxy, PIP_INDEX_URL another index); --python names a Python that has them already. The installer's \
-         message: {}",
-        line.trim()
+         names a proxy, PIP_INDEX_URL another index); --python names a Python that has them already ({cause})"
     )
 }
 
