@@ -246,7 +246,7 @@ fn a_task_that_no_server_offers_is_refused_and_leaves_no_run() {
     let (output, _) = evaluate_on("unknown", "any_version", &["--tasks=nonsense"]);
     let said = text(&output);
     assert_eq!(output.status.code(), Some(2), "{said}");
-    assert!(said.contains("task: expected one of "), "{said}");
+    assert!(said.contains("--tasks: expected one of "), "{said}");
     assert!(said.contains("got nonsense"), "{said}");
     assert!(!said.contains("rerun"), "{said}");
 }

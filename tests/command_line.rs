@@ -167,7 +167,9 @@ fn shells_and_man_get_what_they_need() {
 fn ctrl_c_ends_a_run_at_any_stage_and_the_same_command_resumes_it() {
     let folder = tempfile::tempdir().expect("a folder");
     let evaluate = || -> Command {
-        let mut command = rever();
+        // A test that runs in the background of a script inherits that Ctrl-C is ignored.
+        let mut command = Command::new("env");
+        command.arg("--default-signal=INT").arg(rever().get_program());
         command.current_dir(folder.path()).arg("evaluate").args([
             "--tasks=stack",
             "--strategies=sample",

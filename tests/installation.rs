@@ -195,7 +195,7 @@ fn a_named_python_that_cannot_run_servers_is_refused_with_a_hint() {
     let bare = copied.path("bare-python");
     write_program(&bare, &format!("exec {} -S \"$@\"", python().python.display()));
     for (named, expected) in [
-        (bare, "lacks mujoco, numpy, gymnasium, zenoh, msgpack: leave --python out"),
+        (bare, "lacks mujoco, numpy, gymnasium, zenoh, msgpack; omit --python"),
         ("/bin/false".into(), "expected a Python, got a program with exit status: 1"),
         (
             "/nowhere/python".into(),
