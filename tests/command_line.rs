@@ -182,19 +182,24 @@ fn ctrl_c_ends_a_run_at_any_stage_and_the_same_command_resumes_it() {
         command.arg("--python").arg(&python().python);
         command
     };
-    let interrupted = |is_time: &dyn Fn() -> bool| {
+    let interrupted = |is_time: &dyn Fn(u32) -> bool| {
         let mut child =
             evaluate().stderr(Stdio::null()).stdout(Stdio::null()).spawn().expect("it starts");
-        wait_for("the moment", WAIT, || is_time().then_some(()));
+        wait_for("the moment", WAIT, || is_time(child.id()).then_some(()));
         let id = Pid::from_child(&child);
         kill_process(id, Signal::INT).expect("it runs");
         wait_for("its end", WAIT, || child.try_wait().expect("a child can be asked"))
     };
-    let early = interrupted(&|| true);
+    // `env` has become `rever`.
+    let is_rever = |process| {
+        let name = std::fs::read_to_string(format!("/proc/{process}/comm"));
+        name.is_ok_and(|name| name.trim() == "rever")
+    };
+    let early = interrupted(&is_rever);
     assert!(!early.success(), "{early}");
     let records =
         || std::fs::read_dir(folder.path().join("run/episodes")).map_or(0, Iterator::count);
-    let later = interrupted(&|| records() > 0);
+    let later = interrupted(&|_| records() > 0);
     assert_eq!(later.code(), Some(130), "{later}");
     assert!((1..4).contains(&records()), "{} records", records());
     let output = run(&mut evaluate());
