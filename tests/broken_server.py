@@ -248,7 +248,7 @@ def ignore_unanswered() -> None:
 
 def beats_wildly() -> None:
     """Every second heartbeat cannot be read; the others tell of more memory each time."""
-    sent, told = itertools.count(), itertools.count()
+    sent, reported = itertools.count(), itertools.count()
     encode = protocol.HEARTBEAT.encode
     protocol.HEARTBEAT.encode = (  # type: ignore[method-assign]
         lambda message: b"nonsense" if next(sent) % 2 else encode(message)
@@ -256,7 +256,9 @@ def beats_wildly() -> None:
 
     @wrap(Server, "_heartbeat")
     def heartbeat(original: Any, self: Any) -> Any:
-        return replace(original(self), resident_bytes=(1 + next(told)) * 6_000_000_000)
+        return replace(
+            original(self), resident_bytes=(1 + next(reported)) * 6_000_000_000
+        )
 
 
 DEFECTS = {

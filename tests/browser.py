@@ -50,6 +50,13 @@ class Report:
             text.removeprefix("window.reverCatalogue = ").removesuffix(";\n")
         )
 
+    def episodes_of(self, setting: int) -> list[dict[str, Any]]:
+        """The episodes of one setting, in the order of the list."""
+        pairs = self.catalogue["pairs"]
+        return [
+            e for pair in pairs for e in pair["episodes"] if e["setting"] == setting
+        ]
+
     @contextmanager
     def page(self, link: str = "", width: int = 1440, **options: Any) -> Iterator[Page]:
         """Opens the page; at the end nothing may have gone wrong in it."""

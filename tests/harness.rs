@@ -1,5 +1,6 @@
 //! Shared by all tests of processes: the built program, Python, and waits with a limit.
 
+use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
@@ -54,6 +55,23 @@ pub fn python() -> &'static PythonEnvironment {
 pub fn installation() -> Installation {
     let variables = std::env::vars_os().collect();
     Installation::checkout(repository(), &Host { variables, ..Host::default() })
+}
+
+/// All files and folders below a folder, with their metadata.
+pub fn entries_below(folder: &Path) -> impl Iterator<Item = (PathBuf, Metadata)> {
+    let mut folders = vec![folder.to_owned()];
+    let mut found = Vec::new();
+    while let Some(folder) = folders.pop() {
+        for entry in folder.read_dir().expect("a folder") {
+            let entry = entry.expect("a readable folder");
+            let data = entry.metadata().expect("a file");
+            if data.is_dir() {
+                folders.push(entry.path());
+            }
+            found.push((entry.path(), data));
+        }
+    }
+    found.into_iter()
 }
 
 /// Installs Debian's Chromium if this machine has no browser and this is root; otherwise the test says

@@ -1,6 +1,7 @@
 //! The program away from its checkout, in hostile surroundings, and what `doctor` leaves untouched.
 
 use std::collections::BTreeMap;
+use std::fs::Metadata;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -8,7 +9,7 @@ use std::process::{Command, Output};
 use runtime::servers::{Missing, simulators_environment};
 use tempfile::TempDir;
 
-use crate::harness::{installation, python, repository, rever, run, text};
+use crate::harness::{entries_below, installation, python, repository, rever, run, text};
 
 /// Each alone stops a server, or changes what it imports or draws, if it gets there.
 const HOSTILE: [(&str, &str); 18] = [
@@ -63,19 +64,8 @@ impl Copied {
 
     /// All files by their contents' lengths.
     fn files(&self) -> BTreeMap<PathBuf, u64> {
-        let mut files = BTreeMap::new();
-        let mut folders = vec![self.folder.path().to_owned()];
-        while let Some(folder) = folders.pop() {
-            for entry in folder.read_dir().expect("a folder") {
-                let entry = entry.expect("a readable folder");
-                let data = entry.metadata().expect("a file");
-                if data.is_dir() {
-                    folders.push(entry.path());
-                }
-                files.insert(entry.path(), if data.is_dir() { 0 } else { data.len() });
-            }
-        }
-        files
+        let length = |data: Metadata| if data.is_dir() { 0 } else { data.len() };
+        entries_below(self.folder.path()).map(|(path, data)| (path, length(data))).collect()
     }
 
     /// What pip leaves of a wheel that requires this package: a record, and the Python beside the program.

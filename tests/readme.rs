@@ -24,8 +24,8 @@ const DOCUMENTS: [&str; 5] = [
 ];
 /// Settings of tools that a reader of the tree does not look for.
 const NOT_LISTED: [&str; 3] = [".gitignore", ".dockerignore", ".gitattributes"];
-/// What a bare machine cannot run, for it builds, installs, downloads or needs another machine. Whole commands; beginnings end
-/// with a space.
+/// Commands that this test does not run: they compile, install, download or need another machine. An entry that ends with a
+/// space is the beginning of a command.
 const NOT_RUN: [&str; 15] = [
     "(cd env-server && python -m pytest)",
     "cargo build --release --features cuda",

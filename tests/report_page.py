@@ -161,12 +161,7 @@ def shows_one_setting_alone(report: Report) -> None:
         )
         assert "with=" not in page.url
         left = report.catalogue["compared"][0]
-        outcomes = [
-            e["outcome"]
-            for p in report.catalogue["pairs"]
-            for e in p["episodes"]
-            if e["setting"] == left
-        ]
+        outcomes = [e["outcome"] for e in report.episodes_of(left)]
         page.select_option("#filter-result", "outcome-success")
         assert page.locator("#rows .row").count() == outcomes.count("success")
         page.click("#beside")
@@ -227,12 +222,7 @@ def everything_works_by_keyboard(report: Report) -> None:
 
 def links_lead_to_an_episode_and_a_step(report: Report) -> None:
     left = report.catalogue["compared"][0]
-    ids = [
-        e["id"]
-        for p in report.catalogue["pairs"]
-        for e in p["episodes"]
-        if e["setting"] == left
-    ]
+    ids = [e["id"] for e in report.episodes_of(left)]
     for width in [390, 1440]:
         with report.page(f"#episode={ids[-1]}&step=12", width=width) as page:
             wait_for(page, "document.querySelector('#scrubber').value === '12'")

@@ -1,12 +1,15 @@
 //! The page of a run in a real browser: `report_page.py` drives Chromium through it.
 
 use std::collections::BTreeMap;
+use std::fs::Metadata;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use crate::evaluation::Evaluation;
-use crate::harness::{ensure_browser, python, repository, rever, run, succeed, text};
+use crate::harness::{
+    ensure_browser, entries_below, python, repository, rever, run, succeed, text,
+};
 
 /// The shipped verifier wins some of these pairs, which are the same in every run.
 const ARGUMENTS: [&str; 8] = [
@@ -57,19 +60,8 @@ fn the_page_of_a_run_works_in_a_browser() {
         .expect("standard error is open");
 }
 
-/// Everything below a folder with its size and time of change.
+/// Size and modification time of everything in a folder.
 fn files(folder: &Path) -> BTreeMap<PathBuf, (u64, SystemTime)> {
-    let mut found = BTreeMap::new();
-    let mut folders = vec![folder.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in folder.read_dir().expect("a folder") {
-            let entry = entry.expect("a readable folder");
-            let data = entry.metadata().expect("a file");
-            if data.is_dir() {
-                folders.push(entry.path());
-            }
-            found.insert(entry.path(), (data.len(), data.modified().expect("a time")));
-        }
-    }
-    found
+    let times = |data: Metadata| (data.len(), data.modified().expect("a time"));
+    entries_below(folder).map(|(path, data)| (path, times(data))).collect()
 }

@@ -1,5 +1,4 @@
-//! Tells the program the commit that it is built from, and when, packs the files that it carries, and lays out the Python
-//! package for the wheel.
+//! Sets the program's commit and build date, packs the files embedded in it, and copies the Python package for the wheel.
 
 #![allow(clippy::disallowed_methods, reason = "cargo tells a build script everything in variables")]
 
@@ -17,10 +16,10 @@ use tar::{Builder, Header};
 /// Seconds since 1970, set where builds must be reproducible.
 const SOURCE_DATE: &str = "SOURCE_DATE_EPOCH";
 const ROOT: &str = "../..";
-/// The Python package and what an installed one holds beside its modules.
+/// The Python package, and the assets that an installed one contains.
 const PACKAGE: &str = "env-server/rever_env";
 const ASSETS: &str = "env-server/assets";
-/// Files and folders that environment servers and the shipped policy are made of, as they are in a checkout.
+/// Embedded files and folders, with their paths in a checkout: environment servers and the included policy.
 const CARRIED: [&str; 8] = [
     "env-server/assets",
     "env-server/requirements.lock",
@@ -52,7 +51,7 @@ fn commit() -> String {
     text.trim().to_owned()
 }
 
-/// Of the build, RFC 3339.
+/// The build date, RFC 3339.
 fn date() -> String {
     let asked = std::env::var(SOURCE_DATE).ok().and_then(|secs| secs.parse().ok());
     let time = asked.map(|secs| SystemTime::UNIX_EPOCH + Duration::from_secs(secs));
@@ -75,7 +74,7 @@ fn pack() -> Result<String, Box<dyn Error>> {
 /// Copies the package to where pyproject.toml takes it from.
 fn lay_out_package() -> Result<(), Box<dyn Error>> {
     let package = PathBuf::from(std::env::var("OUT_DIR")?).join("rever_env");
-    // Files that are gone must not stay in the wheel.
+    // Deleted files must not stay in the wheel.
     if package.exists() {
         std::fs::remove_dir_all(&package)?;
     }
@@ -96,7 +95,7 @@ fn copy(from: &Path, to: &Path) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// In order, without what Python compiles.
+/// Sorted, without compiled Python files.
 fn names_in(folder: &Path) -> Result<Vec<OsString>, Box<dyn Error>> {
     let entries: Result<Vec<_>, _> = folder.read_dir()?.collect();
     let mut names: Vec<_> = entries?.into_iter().map(|entry| entry.file_name()).collect();

@@ -56,7 +56,7 @@ def test_an_error_is_one_line(arguments: str, status: int, words: str) -> None:
         ("serve --arguments notjson", "--arguments: expected a JSON object, got notjson"),
         ("serve --listen 127.0.0.1", "endpoint '127.0.0.1': expected tcp/HOST:PORT or HOST:PORT"),
         ("serve --listen tcp/127.0.0.1:99999", "expected tcp/HOST:PORT or HOST:PORT"),
-        ("serve --listen tcp/127.0.0.1:9 --fleet ../x", "cannot stand in a key"),
+        ("serve --listen tcp/127.0.0.1:9 --fleet ../x", "invalid fleet name"),
         ("serve --listen tcp/127.0.0.1:9 --sessions 0", "--sessions: expected 1 to 256, got 0"),
         ("", "the following arguments are required: COMMAND"),
     ],

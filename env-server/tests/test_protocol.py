@@ -263,7 +263,7 @@ def test_keys_lie_under_version_and_fleet() -> None:
 
 @pytest.mark.parametrize("name", ["", "*", "**", "a/b", "a b", "$*", "a?b", "ä", "a" * 65, "a\n"])
 def test_a_name_with_wildcards_or_slashes_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match="cannot stand in a key"):
+    with pytest.raises(ValueError, match=r"invalid fleet name"):
         Keys(name)
 
 

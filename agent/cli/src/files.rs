@@ -5,6 +5,9 @@ use std::path::PathBuf;
 use anyhow::{Result, ensure};
 use runtime::servers::{Bundle, Host, Installation, Missing};
 
+/// A policy's own verifier, in the policy's folder.
+pub const VERIFIER_FILE: &str = "verifier.safetensors";
+
 const BUNDLE: Bundle = Bundle {
     archive: include_bytes!(concat!(env!("OUT_DIR"), "/files.tar.gz")),
     digest: env!("REVER_FILES_DIGEST"),

@@ -85,6 +85,21 @@ impl Strategy {
         }
     }
 
+    /// What it executes, in one line for help and lists.
+    pub fn meaning(self) -> &'static str {
+        match self {
+            Strategy::Greedy => "the most likely token at every position; one candidate",
+            Strategy::Sample => "the first sampled candidate: the baseline",
+            Strategy::FirstWellFormed => "the first of N candidates that holds a valid action",
+            Strategy::Majority => "the action that most candidates agree with (self-consistency)",
+            Strategy::Medoid => "the candidate nearest to all others",
+            Strategy::Verifier => "the highest verifier score: ReVer",
+            Strategy::Worst => "the lowest verifier score: a control",
+            Strategy::VerifierMedoid => "verifier score minus the distance to the other candidates",
+            Strategy::Oracle => "the candidate nearest to the scripted expert: an upper bound",
+        }
+    }
+
     /// Number of candidates to propose if `requested` are requested: greedy and single sample need
     /// one.
     pub fn candidates(self, requested: usize) -> usize {

@@ -1,4 +1,4 @@
-//! A recorded episode once more: the same reset, the same actions, and a check that the same happens.
+//! Repeats a recorded episode: the same reset, the same actions, and a check that states and statistics are equal.
 
 use anyhow::{Context, Result, ensure};
 use protocol::{Image, Reset};
@@ -6,8 +6,8 @@ use store::record::EpisodeRecord;
 
 use crate::session::{Environment, Episode};
 
-/// Repeats a recorded episode on a session and hands over its images, the first before the first step. An error when
-/// something else happens than what was recorded.
+/// Repeats a recorded episode on a session and passes its images to `on_image`, the first before the first step. Fails if
+/// a state or statistic differs from the record.
 pub async fn replay<E: Environment>(
     environment: E,
     record: &EpisodeRecord,

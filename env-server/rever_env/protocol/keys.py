@@ -59,6 +59,6 @@ class Keys:
 def _checked(what: str, name: str) -> str:
     if not _NAME.fullmatch(name):
         raise ValueError(
-            f'{what} "{name}" cannot stand in a key: expected 1 to 64 of a-z A-Z 0-9 . _ -'
+            f'invalid {what} name "{name}": expected 1 to 64 characters from a-z A-Z 0-9 . _ -'
         )
     return name

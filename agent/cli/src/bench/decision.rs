@@ -291,7 +291,7 @@ mod tests {
         let agent = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("a folder");
         let model = agent.join("models/bridge-small");
         let policy = Vla::load(&model, DeviceName::Cpu).expect("the shipped policy");
-        let file = model.join("verifier.safetensors");
+        let file = model.join(crate::files::VERIFIER_FILE);
         let digest = policy.parser().digest();
         let verifier = Verifier::load(&file, digest).expect("the shipped verifier");
         let observations =

@@ -249,7 +249,7 @@ fn servers(
 fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
     let folder = policy_folder(arguments.policy.as_ref(), host)?;
     let policy = Vla::load(&folder, arguments.device)?;
-    let file = folder.join("verifier.safetensors");
+    let file = folder.join(files::VERIFIER_FILE);
     let verifier = Verifier::load(&file, policy.parser().digest())?;
     let count = usize::from(arguments.servers);
     let servers = servers(host, count, arguments.simulator, arguments.python)?;
@@ -304,7 +304,7 @@ fn decision(arguments: DecisionArguments, host: &Host) -> Result<()> {
         arguments.device
     );
     let folder = policy_folder(arguments.policy.as_ref(), host)?;
-    let file = arguments.verifier.unwrap_or_else(|| folder.join("verifier.safetensors"));
+    let file = arguments.verifier.unwrap_or_else(|| folder.join(files::VERIFIER_FILE));
     let policy = Vla::load(&folder, arguments.device)?;
     let verifier = Verifier::load(&file, policy.parser().digest())?;
     let recorded = match arguments.observations {

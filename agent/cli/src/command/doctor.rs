@@ -19,7 +19,7 @@ use store::plan::SeedRange;
 use verifier::Verifier;
 use vla::{DeviceName, Vla};
 
-use super::names::{FLEET_DEFAULT, endpoint, fleet};
+use super::names::{FLEET_DEFAULT, endpoint, fleet, short};
 use crate::files;
 
 /// The image size if no policy could be loaded.
@@ -86,7 +86,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     }
     let policy = check(&mut findings, "policy", || check_policy(&folder, &installation));
     if let Some(policy) = &policy {
-        let beside = folder.join("verifier.safetensors");
+        let beside = folder.join(files::VERIFIER_FILE);
         let named = arguments.verifier.as_deref();
         if named.is_none() && !beside.is_file() {
             println!("none  verifier    train one with `rever collect` and `rever train`");
@@ -262,8 +262,4 @@ fn check_decision(policy: &Vla, image: &Image, instruction: &str) -> Result<((),
     let count = candidates.len();
     ensure!(well_formed > 0, "none of {count} candidates is well formed: is this policy trained?");
     Ok(((), format!("{well_formed} of {count} candidates well formed, in {milliseconds} ms")))
-}
-
-fn short(digest: &str) -> &str {
-    digest.get(..12).unwrap_or(digest)
 }

@@ -22,6 +22,7 @@ use vla::DeviceName;
 
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use super::{Output, WrongUsage, policy, selection};
+use crate::files::VERIFIER_FILE;
 use crate::{build_info, files};
 
 /// Default number of server processes on this machine.
@@ -30,8 +31,6 @@ const SERVERS_DEFAULT: u16 = 2;
 const SESSIONS_DEFAULT: u16 = 16;
 /// The default label store.
 const LABELS_DEFAULT: &str = "runs/labels.sqlite";
-/// File name of a policy's own verifier, in the policy's folder.
-const VERIFIER_FILE: &str = "verifier.safetensors";
 
 /// Which tasks to run, on which servers, and what to record.
 #[derive(Debug, Clone, Args)]

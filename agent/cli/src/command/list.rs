@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
@@ -14,8 +15,13 @@ use runtime::wire::Fleet;
 use store::run;
 
 use super::episodes;
-use super::names::{FLEET_DEFAULT, endpoint, fleet, strategy_meaning};
+use super::names::{FLEET_DEFAULT, endpoint, fleet};
 use crate::files;
+
+/// Maximum length of a command line in the list of runs.
+const COMMAND_CHARACTERS_MAX: usize = 60;
+/// How long to wait for further servers after the first.
+const OTHERS_WAIT: Duration = Duration::from_secs(2);
 
 /// List tasks, variants, strategies, runs or servers
 #[derive(Debug, Args)]
@@ -114,12 +120,6 @@ fn ask(source: &ServerSource) -> Result<Fleet> {
     fleet
 }
 
-/// Maximum length of a command line in the list of runs.
-const COMMAND_CHARACTERS_MAX: usize = 60;
-
-/// How long to wait for further servers after the first.
-const OTHERS_WAIT: std::time::Duration = std::time::Duration::from_secs(2);
-
 fn tasks(fleet: &Fleet, is_listed: impl Fn(&TaskDescription) -> bool) -> Vec<Vec<String>> {
     let mut listed: BTreeMap<(usize, String), &TaskDescription> = BTreeMap::new();
     for server in fleet.servers.values() {
@@ -160,8 +160,7 @@ fn servers(fleet: &Fleet) -> Vec<Vec<String>> {
 }
 
 fn strategies() -> Vec<Vec<String>> {
-    let row =
-        |strategy: Strategy| vec![strategy.to_string(), strategy_meaning(strategy).to_owned()];
+    let row = |strategy: Strategy| vec![strategy.to_string(), strategy.meaning().to_owned()];
     headed(["strategy", "executes"], Strategy::ALL.into_iter().map(row))
 }
 

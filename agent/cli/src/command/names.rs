@@ -55,26 +55,15 @@ impl TypedValueParser for StrategyParser {
     }
 
     fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
-        let value = |strategy: Strategy| {
-            PossibleValue::new(strategy.name()).help(strategy_meaning(strategy))
-        };
+        let value =
+            |strategy: Strategy| PossibleValue::new(strategy.name()).help(strategy.meaning());
         Some(Box::new(Strategy::ALL.into_iter().map(value)))
     }
 }
 
-/// What a strategy does, in one line.
-pub fn strategy_meaning(strategy: Strategy) -> &'static str {
-    match strategy {
-        Strategy::Greedy => "the most likely token at every position; one candidate",
-        Strategy::Sample => "the first sampled candidate: the baseline",
-        Strategy::FirstWellFormed => "the first of N candidates that holds a valid action",
-        Strategy::Majority => "the action that most candidates agree with (self-consistency)",
-        Strategy::Medoid => "the candidate nearest to all others",
-        Strategy::Verifier => "the highest verifier score: ReVer",
-        Strategy::Worst => "the lowest verifier score: a control",
-        Strategy::VerifierMedoid => "verifier score minus the distance to the other candidates",
-        Strategy::Oracle => "the candidate nearest to the scripted expert: an upper bound",
-    }
+/// The first digits of a digest: enough to tell versions apart by eye.
+pub fn short(digest: &str) -> &str {
+    digest.get(..12).unwrap_or(digest)
 }
 
 #[cfg(test)]

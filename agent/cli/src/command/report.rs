@@ -16,7 +16,7 @@ use store::run;
 use terms::ScoreTerms;
 use vla::CompletionParser;
 
-/// Episodes whose steps are written unless told otherwise: some 100 MB at the most.
+/// Default number of episodes whose steps are written: about 100 MB.
 pub const EPISODES_MAX: usize = 1000;
 
 /// Servers that render videos: one per core of a small machine.
@@ -28,11 +28,11 @@ pub struct Arguments {
     /// The run's folder
     run: PathBuf,
     /// The report's folder [default: `report` in the run's folder]
-    #[arg(long)]
+    #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Folder of the policy that the run was made with; its tokenizer turns tokens into text
-    /// [default: the one that comes with rever]
-    #[arg(long)]
+    /// [default: the policy that comes with rever]
+    #[arg(long, value_name = "FOLDER")]
     policy: Option<PathBuf>,
     /// Verifier that scored the run, to show the terms of its scores
     /// [default: verifier.safetensors in the policy's folder]
@@ -48,10 +48,10 @@ pub struct Arguments {
     /// Simulator for --video, which must be the one that the run was made with
     #[arg(long, value_enum, default_value_t, requires = "video")]
     simulator: Simulator,
-    /// A Python that has the packages of env-server, instead of the one that rever sets up
+    /// Python interpreter for the servers, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE", requires = "video")]
     python: Option<PathBuf>,
-    /// Also write what was made to this file
+    /// Also write the results to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
 }

@@ -25,21 +25,20 @@ pub struct Arguments {
 /// Prints the description.
 pub fn run(arguments: &Arguments, output: Output) -> Result<()> {
     let path = &arguments.path;
-    if run::read_header(path).is_ok() {
-        show_run(path, output)
-    } else if path.is_file() {
+    if path.is_file() {
         print!("{}", train::table(&Verifier::load_any(path)?));
         println!("next: rever evaluate --strategies sample,verifier --verifier {}", path.display());
         Ok(())
     } else if path.join("config.json").is_file() {
         show_policy(path)
     } else {
-        Err(WrongUsage(format!(
-            "show: expected a run's folder (run.json), a checkpoint's folder (config.json) or a verifier's file, got {}; \
-             `rever list runs` lists runs",
-            path.display()
-        ))
-        .into())
+        run::read_header(path).map_err(|error| {
+            WrongUsage(format!(
+                "show: expected a run's folder (run.json), a checkpoint's folder (config.json) or a verifier's file; \
+                 `rever list runs` lists runs: {error:#}"
+            ))
+        })?;
+        show_run(path, output)
     }
 }
 

@@ -19,7 +19,7 @@ use verifier::{
 use vla::CompletionParser;
 
 use super::WrongUsage;
-use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
+use super::names::{self, FLEET_DEFAULT, endpoint, fleet, short};
 use crate::files::policy_folder;
 
 /// How long to wait for an agent that follows the verifier. After that it is published anyway.
@@ -271,11 +271,6 @@ fn ranking_text(verifier: &Verifier) -> String {
 
 fn figure(value: Option<f64>) -> String {
     value.map_or("–".to_owned(), |value| format!("{value:.3}"))
-}
-
-/// The first digits of a digest, enough to distinguish versions by eye.
-fn short(digest: &str) -> &str {
-    digest.get(..12).unwrap_or(digest)
 }
 
 fn publish(arguments: &Arguments, name: &str, verifier: &Verifier) -> Result<()> {

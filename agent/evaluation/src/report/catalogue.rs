@@ -249,7 +249,7 @@ fn grant_details(pairs: &mut [Pair], opening: usize, details_max: usize) {
     }
 }
 
-/// What became of an episode, told by its last step and by what it had reached before; `none` where the policy never acted.
+/// The outcome of an episode: of its last step, or what it had reached before; `none` where the policy never acted.
 fn outcome(summary: &EpisodeSummary) -> &'static str {
     let statistics = &summary.statistics;
     if never_acted(summary) {

@@ -1,4 +1,4 @@
-//! A figure on the page: drawn for wide and for narrow screens, with its numbers as CSV for the page to hand over.
+//! A figure on the page: drawn for wide and for narrow screens, with its numbers as CSV for a download.
 
 use super::escape::html;
 

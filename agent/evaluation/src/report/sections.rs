@@ -158,7 +158,7 @@ fn point(result: &SettingResult) -> Option<Point> {
 }
 
 fn verifier(scored: &[Scored]) -> String {
-    // Where there was a choice the score decided it, so calibration is told from single samples.
+    // Where there was a choice the score decided it. Calibration is therefore computed from single samples.
     let mut single: Vec<Scored> = scored.iter().copied().filter(|one| !one.is_selected).collect();
     let mut kind = "single samples";
     if single.is_empty() {

@@ -24,7 +24,7 @@ const RATES: [Column; 6] = [
     ("faults", "fault"),
 ];
 
-/// Success and what is told beside it; one row per setting.
+/// Success and the other rates; one row per setting.
 pub fn rates(settings: &[SettingResult]) -> String {
     let mut header = vec!["setting".to_owned()];
     for name in ["success", "any_step", "released", "grasped"] {

@@ -10,8 +10,8 @@ use verifier::training::records::CompletionReader;
 use verifier::{LOGITS_PER_PROBABILITY, Verifier, explain, term_names};
 use vla::CompletionParser;
 
-/// The verifier's file in a policy's folder.
-const VERIFIER_FILE: &str = "verifier.safetensors";
+use crate::command::names::short;
+use crate::files::VERIFIER_FILE;
 
 /// Terms whose scores differ by more than this from the recorded ones explain something else.
 const SCORE_TOLERANCE: f64 = 1e-3;
@@ -58,9 +58,9 @@ impl<'a> ScoreTerms<'a> {
         };
         let Some(verifier) = self.verifier.as_ref().filter(|one| one.digest() == digest) else {
             return unknown(format!(
-                "The terms of the scores are not shown: the verifier that gave them (digest {}…) was not at hand when \
+                "The terms of the scores are not shown: the verifier that gave them (digest {}…) was not available when \
                  this page was built. `rever report RUN --verifier FILE` shows them.",
-                digest.get(..12).unwrap_or(digest)
+                short(digest)
             ));
         };
         let parser = self.parser;

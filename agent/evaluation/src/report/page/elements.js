@@ -21,7 +21,7 @@ function byId(id) {
   return document.getElementById(id);
 }
 
-// A button that keeps its focus when its surroundings are made anew; `key` names it within them.
+// A button that keeps its focus when its surroundings are rebuilt; `key` names it within them.
 function button(className, text, key, action) {
   const made = element("button", className, text);
   made.type = "button";
