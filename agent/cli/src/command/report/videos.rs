@@ -17,10 +17,10 @@ use store::video::Video;
 
 /// Height and width of the images: larger than a policy's, for people. Physics do not depend on them.
 const IMAGE_SIZE: (usize, usize) = (240, 320);
-/// How long a session is waited for.
+/// Timeout for a session.
 const SESSION_WAIT: Duration = Duration::from_secs(60);
 
-/// Renders what is missing of the first `episodes_max` episodes into the run's folder; the number of videos made.
+/// Renders the missing videos of the first `episodes_max` episodes into the run's folder. Returns their number.
 pub fn render(folder: &Path, local: LocalSource, episodes_max: usize) -> Result<usize> {
     let ids = run::recorded(folder)?.into_iter().take(episodes_max);
     let missing = ids.filter(|id| !run::video_path(folder, id).is_file());
@@ -29,7 +29,6 @@ pub fn render(folder: &Path, local: LocalSource, episodes_max: usize) -> Result<
     let videos = run::video_path(folder, first);
     check_writable(videos.parent().context("a video lies in a folder")?)?;
     let first = EpisodeRecord::read(&run::record_path(folder, first))?;
-    let workers = local.count;
     let source = ServerSource {
         local: Some(local),
         connect: Vec::new(),
@@ -38,12 +37,12 @@ pub fn render(folder: &Path, local: LocalSource, episodes_max: usize) -> Result<
     };
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
     let deployment = source.open(&runtime, 1)?;
-    let result = runtime.block_on(render_all(folder, &deployment, &first, &missing, workers));
+    let result = runtime.block_on(render_all(folder, &deployment, &first, &missing));
     deployment.close(&runtime)?;
     result.map(|()| missing.len())
 }
 
-/// Found out before servers are started: a run may belong to somebody else.
+/// Checked before servers start: a run may belong to another user.
 fn check_writable(videos: &Path) -> Result<()> {
     std::fs::create_dir_all(videos)
         .and_then(|()| tempfile::tempfile_in(videos).map(drop))
@@ -57,7 +56,6 @@ async fn render_all(
     deployment: &Deployment,
     first: &EpisodeRecord,
     missing: &[String],
-    workers: usize,
 ) -> Result<()> {
     deployment.first_servers().await?;
     let options = PoolOptions {
@@ -80,12 +78,10 @@ async fn render_all(
             bar.inc(1);
         }
     };
-    let done = match workers {
-        1 => work().await,
-        _ => tokio::try_join!(work(), work()).map(drop),
-    };
+    // Two servers of one session each.
+    let done = tokio::try_join!(work(), work());
     bar.finish_and_clear();
-    done
+    done.map(drop)
 }
 
 async fn render_one(folder: &Path, pool: &ZenohPool, id: &str) -> Result<()> {
