@@ -11,6 +11,7 @@
 
 // Tasks and actions.
 mod action;
+mod rotation;
 mod task;
 
 // Proposals of a policy.
@@ -27,6 +28,7 @@ mod tracker;
 // The complete decision.
 mod context;
 mod decider;
+mod episode;
 
 #[cfg(any(test, feature = "scripted"))]
 pub mod scripted;
@@ -35,9 +37,11 @@ pub use action::{Action, ActionChunk, ActionSpace};
 pub use candidate::{Candidate, CandidateAction, Parsed, Proposal, ProposalRequest};
 pub use context::{EpisodeContext, step_seed};
 pub use decider::{Decider, Decision, DecisionFault, DecisionRequest};
+pub use episode::{EpisodeName, EpisodeToken, EpisodeWatch};
 pub use policy::{Policy, PolicyInfo};
 pub use protocol::message::{Image, Observation};
 pub use reasoning::{Malformed, Reasoning, TAGS, VisibleObject, last_tag};
+pub use rotation::{quaternion, rotation_vector};
 pub use scorer::{Scorer, ScoringRequest, probability};
 pub use setting::Setting;
 pub use strategy::{

@@ -252,6 +252,7 @@ fn check_decision(policy: &Vla, image: &Image, instruction: &str) -> Result<((),
         candidates: 5,
         temperature: 1.0,
         seed: 0,
+        episode: None,
     };
     let begun = Instant::now();
     let proposals = policy.propose_now(&[request])?;
