@@ -18,6 +18,9 @@ pub struct EpisodeContext {
     pub scorer: Option<Arc<dyn Scorer>>,
     /// Seed of the policy's sampling, the same for every strategy.
     pub sampling_seed: u64,
+    /// Seed of the policy's sampling in the next decision, where a client of a policy server gives
+    /// one; otherwise it is derived from `sampling_seed` and `step`.
+    pub decision_seed: Option<u64>,
     /// Number of control steps so far.
     pub step: u32,
     /// Object positions according to the reasoning so far.
@@ -40,6 +43,7 @@ impl EpisodeContext {
             instruction: instruction.into(),
             scorer,
             sampling_seed,
+            decision_seed: None,
             step: 0,
             tracker: ObjectTracker::default(),
             hold_still: ActionSpace::hold_still(action),
@@ -48,7 +52,7 @@ impl EpisodeContext {
 
     /// Seed of the policy's sampling at this control step.
     pub fn seed(&self) -> u64 {
-        step_seed(self.sampling_seed, self.step)
+        self.decision_seed.unwrap_or_else(|| step_seed(self.sampling_seed, self.step))
     }
 
     /// The action to execute if no candidate is well formed.

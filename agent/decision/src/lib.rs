@@ -9,8 +9,9 @@
 //! Rollouts, the benchmark and the tests use it. A failure of the policy or of a scorer is a fault
 //! of the episode in which it occurred, never an outcome.
 
-// Tasks and actions.
+// Tasks, actions and seeds.
 mod action;
+mod seeds;
 mod task;
 
 // Proposals of a policy.
@@ -39,6 +40,7 @@ pub use policy::{Policy, PolicyInfo};
 pub use protocol::message::{Image, Observation};
 pub use reasoning::{Malformed, Reasoning, TAGS, VisibleObject, last_tag};
 pub use scorer::{Scorer, ScoringRequest, probability};
+pub use seeds::{episode_hash, episode_name, sampling_seed};
 pub use setting::Setting;
 pub use strategy::{
     Alternatives, MAJORITY_TOLERANCE_BINS, MEDOID_WEIGHT_LOGITS, Strategy, UnknownStrategy,

@@ -4,6 +4,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use batching::{Answer, DecisionBatcher};
 use decision::{Candidate, Decision, EpisodeContext, Observation, PolicyInfo, Scorer, probability};
 use protocol::{Reset, TaskDescription};
 use store::queue::Lease;
@@ -13,7 +14,6 @@ use store::record::{
 };
 
 use super::RecordOptions;
-use super::batcher::{Answer, DecisionBatcher};
 use crate::fault::AttemptFault;
 use crate::session::{Environment, Episode, Session, SessionInfo, SessionPool};
 use crate::sinks::{Event, Sinks};

@@ -12,13 +12,13 @@
 //! batch. A failed attempt is dropped, recorded as a fault and repeated; only an episode that ended
 //! is recorded.
 
-mod batcher;
 mod episode;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::{Context, Result};
+use batching::DecisionBatcher;
 use decision::{Decider, Scorer};
 use store::queue::{Disposition, EpisodeQueue, Lease};
 use store::record::{EpisodeRecord, Versions};
@@ -30,7 +30,6 @@ use crate::fault::AttemptFault;
 use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 use crate::sinks::{Event, Sinks};
 use crate::stop::{Stop, asked};
-use batcher::DecisionBatcher;
 use episode::EpisodeRun;
 
 /// Optional content of records.
