@@ -63,7 +63,7 @@ impl VisionBackbone {
         let mut towers = Vec::new();
         for (index, config) in configs.iter().enumerate() {
             let fused_first = configs.len() == 2 && index == 0;
-            let normalisation = if fused_first { DINO } else { SIGLIP };
+            let normalisation = if fused_first || config.is_dino() { DINO } else { SIGLIP };
             let name = TOWER_NAMES[index];
             towers.push(Tower::load(weights.part(name), config, name, normalisation)?);
         }
