@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use decision::{
-    Decider, DecisionRequest, EpisodeContext, Observation, Policy, ProposalRequest, Scorer,
-    Setting as EpisodeSetting, Strategy,
+    ActionSpace, Decider, DecisionRequest, EpisodeContext, Observation, Policy, ProposalRequest,
+    Scorer, Setting as EpisodeSetting, Strategy,
 };
 use evaluation::statistics::quantile;
 use protocol::Dimension;
@@ -190,8 +190,9 @@ impl DecisionBench<'_> {
         let setting = EpisodeSetting { strategy, candidates: candidates as u32, temperature };
         let start = Instant::now();
         let instruction = observation.instruction.clone();
-        let mut context =
-            EpisodeContext::new(setting, seed, instruction, scorer, &[] as &[Dimension]);
+        // Without a well-formed candidate the decision is to hold still.
+        let action = dimensions(&self.policy.info().action_space);
+        let mut context = EpisodeContext::new(setting, seed, instruction, scorer, &action);
         let request = DecisionRequest { observation, context: &mut context };
         let decided = self.runtime.block_on(decider.decide(vec![request]));
         let decision = decided.into_iter().next().context("no decision")??;
@@ -295,6 +296,17 @@ impl Samples {
         self.ms.push(ms);
         self.tokens += tokens;
     }
+}
+
+/// An action's dimensions, as a task would describe them.
+fn dimensions(space: &ActionSpace) -> Vec<Dimension> {
+    let dimension = |index: usize| Dimension {
+        name: if space.gripper == Some(index) { "gripper" } else { "motion" }.to_owned(),
+        low: None,
+        high: None,
+        discrete: false,
+    };
+    (0..space.length()).map(dimension).collect()
 }
 
 /// The strategy that compares candidates: the verifier's, or the medoid, which needs none.

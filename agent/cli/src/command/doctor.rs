@@ -171,11 +171,14 @@ fn check_policy(
     installation: &Installation,
 ) -> Result<(Arc<dyn Policy>, String)> {
     let begun = Instant::now();
-    let LoadedPolicy { policy, .. } = arguments.load_folder(folder.to_owned())?;
+    let LoadedPolicy { policy, checkpoint, .. } = arguments.load_folder(folder.to_owned())?;
     let PolicyInfo { digest, image_size: (height, width), hidden_size, .. } = policy.info();
     let hidden = hidden_size.map_or("none".to_owned(), |size| size.to_string());
+    let mut description = checkpoint.iter().flat_map(|one| one.parser().description());
+    let thought = description.find(|(name, _)| *name == "chain of thought");
+    let thought = thought.map_or_else(|| "unknown".to_owned(), |(_, value)| value);
     let text = format!(
-        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden size {hidden}",
+        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden size {hidden}, chain of thought: {thought}",
         place(folder, installation),
         begun.elapsed().as_millis(),
         short(digest),
