@@ -13,6 +13,7 @@
 //! is recorded.
 
 mod episode;
+mod first_decisions;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -31,6 +32,8 @@ use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 use crate::sinks::{Event, Sinks};
 use crate::stop::{Stop, asked};
 use episode::EpisodeRun;
+use first_decisions::FirstDecisions;
+pub use first_decisions::{NeverWellFormed, first_malformed};
 
 /// Optional content of records.
 #[derive(Debug, Clone, Copy, Default)]
@@ -74,6 +77,7 @@ impl<P: SessionPool> Rollout<P> {
         let shared = Arc::new(Shared {
             rollout: self,
             batcher,
+            first_decisions: FirstDecisions::new(),
             active,
             leased: AtomicUsize::new(0),
             returned: Notify::new(),
@@ -104,6 +108,7 @@ impl<P: SessionPool> Rollout<P> {
 struct Shared<P> {
     rollout: Rollout<P>,
     batcher: DecisionBatcher,
+    first_decisions: FirstDecisions,
     /// Number of episodes between reset and end.
     active: Arc<AtomicUsize>,
     /// Number of leases held by workers.
@@ -164,6 +169,10 @@ impl<P: SessionPool> Shared<P> {
                 pool.release(Session { info, environment });
                 queue.complete(lease).await
             }
+            Err(AttemptFault::NeverWellFormed(fault)) => {
+                self.note_fault(lease, &info, fault.clone().into()).await?;
+                Err(fault.into())
+            }
             Err(fault) => self.note_fault(lease, &info, fault).await,
         }
     }
@@ -177,7 +186,8 @@ impl<P: SessionPool> Shared<P> {
             lease,
             options: self.rollout.options,
             versions: &self.rollout.versions,
-            policy: self.rollout.decider.policy().info(),
+            policy: self.rollout.decider.policy().as_ref(),
+            first_decisions: &self.first_decisions,
             scorer: self.rollout.scorer.borrow().clone(),
             batcher: &self.batcher,
             sinks: &self.rollout.sinks,
