@@ -163,7 +163,9 @@ impl Connection {
                 }
                 Some(Ok(Message::Close(_))) | None => return Ok(None),
                 Some(Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_))) => {}
-                Some(Err(Error::Capacity(error))) => return Err((CloseCode::Size, error.to_string())),
+                Some(Err(Error::Capacity(error))) => {
+                    return Err((CloseCode::Size, error.to_string()));
+                }
                 Some(Err(Error::Protocol(error))) => {
                     return Err((CloseCode::Protocol, error.to_string()));
                 }

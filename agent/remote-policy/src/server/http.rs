@@ -76,7 +76,8 @@ impl Service {
         let header = request.headers().get(AUTHORIZATION).map(HeaderValue::as_bytes);
         match &self.key {
             Some(key) if !key.is_in(header) => {
-                let reason = "expected the header \"Authorization: Api-Key KEY\" with this server's key";
+                let reason =
+                    "expected the header \"Authorization: Api-Key KEY\" with this server's key";
                 Some(error(StatusCode::UNAUTHORIZED, reason))
             }
             _ => None,

@@ -97,7 +97,11 @@ fn known_camera<'a, 'b>(map: &'b Value<'a>) -> Result<&'b Value<'a>> {
 
 fn instruction(map: &Value<'_>) -> Result<String> {
     let value = INSTRUCTIONS.iter().find_map(|name| find(map, name)).with_context(|| {
-        format!("expected an instruction under one of {}, got {}", INSTRUCTIONS.join(", "), map.key_names())
+        format!(
+            "expected an instruction under one of {}, got {}",
+            INSTRUCTIONS.join(", "),
+            map.key_names()
+        )
     })?;
     let text = value.as_text().context("instruction")?;
     let bytes = text.len();

@@ -41,10 +41,9 @@ fn answer_candidate(
             action_tokens: if is_whole { parsed.action_tokens.clone() } else { Vec::new() },
             ..AnswerCandidate::default()
         },
-        Err(malformed) => AnswerCandidate {
-            malformed: Some(malformed.to_string()),
-            ..AnswerCandidate::default()
-        },
+        Err(malformed) => {
+            AnswerCandidate { malformed: Some(malformed.to_string()), ..AnswerCandidate::default() }
+        }
     };
     if is_whole {
         answer.tokens.clone_from(&candidate.tokens);
@@ -56,7 +55,8 @@ fn answer_candidate(
     answer
 }
 
-/// A reasoning as text that `Reasoning::parse` reads back; none for a policy that acts without.
+/// A reasoning as text that its parser reads back; none for a policy that acts without. Sections that
+/// were not read are left out.
 fn text_of(reasoning: &Reasoning) -> Option<String> {
     if *reasoning == Reasoning::default() {
         return None;
@@ -74,10 +74,13 @@ fn text_of(reasoning: &Reasoning) -> Option<String> {
         reasoning.subtask.clone(),
         reasoning.move_reasoning.clone(),
         reasoning.movement.clone(),
-        format!("[{}]", positions.collect::<Vec<_>>().join(", ")),
+        match reasoning.gripper_position.is_empty() {
+            true => String::new(),
+            false => format!("[{}]", positions.collect::<Vec<_>>().join(", ")),
+        },
     ];
     let mut text = String::new();
-    for (tag, section) in TAGS.iter().zip(&sections) {
+    for (tag, section) in TAGS.iter().zip(&sections).filter(|(_, section)| !section.is_empty()) {
         text.push_str(&format!("{tag} {section} "));
     }
     text.push_str(TAGS[TAGS.len() - 1]);

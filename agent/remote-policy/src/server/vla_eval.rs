@@ -4,8 +4,8 @@
 use std::collections::VecDeque;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use anyhow::{Context, Result, bail};
-use decision::{Action, TaskId, VARIANT_DEFAULT, episode_name};
+use anyhow::{Context, Result};
+use decision::{Action, TaskId, episode_name};
 
 use super::action_form::{Gripper, Rotation};
 use super::agent::ServedAgent;
@@ -95,7 +95,8 @@ impl VlaEvalClient {
                 Ok(Outcome::Silence)
             }
             Kind::Action => {
-                let reason = "expected hello, episode_start, observation or episode_end, got action";
+                let reason =
+                    "expected hello, episode_start, observation or episode_end, got action";
                 Ok(Outcome::Reply(error_message(reason, sequence)?))
             }
         }
@@ -144,22 +145,17 @@ fn action_value(action: &[f32]) -> Result<Value<'static>> {
     Ok(Array::of_f32(vec![action.len()], action)?.into_value(vla_eval::KEYS))
 }
 
-/// The episode's name in the derivation of its seeds, as in evaluations: `TASK/VARIANT/NUMBER`.
+/// The episode's name in the derivation of its seeds, as in evaluations: `TASK/VARIANT/NUMBER`, where
+/// vla-eval's task is named `TASK` or `TASK/VARIANT`.
 fn episode_of(payload: &Value<'_>) -> Result<String> {
     let task = payload.field("task")?;
     let name = task.field("name").and_then(Value::as_text).context("task.name")?;
-    let variant = match task.get("variant") {
-        Some(variant) => variant.as_text().context("task.variant")?,
-        None => VARIANT_DEFAULT,
-    };
+    let task_id: TaskId = name.parse().map_err(anyhow::Error::msg).context("task.name")?;
     let number: u32 = match task.get("episode_idx") {
         Some(number) => number.as_integer().context("task.episode_idx")?,
         None => 0,
     };
-    if name.is_empty() || variant.is_empty() {
-        bail!("task: expected a name, got an empty one");
-    }
-    Ok(episode_name(&TaskId::new(name, variant), number))
+    Ok(episode_name(&task_id, number))
 }
 
 /// The server's hello.
@@ -176,18 +172,30 @@ pub(super) fn hello_payload(agent: &ServedAgent) -> Result<Value<'static>> {
         ("model_server", Value::text("rever")),
         ("capabilities", Value::map([(extension::KEY, announcement)])),
     ];
-    // A verifier looks at the gripper's position.
-    if agent.options.scorer.is_some() {
-        payload.push(("observation_params", Value::map([("send_state", Value::Bool(true))])));
-    }
+    payload.push(("observation_params", observation_parameters(agent)));
     if agent.info().action_space.gripper == Some(6) {
         payload.push(("action_spec", action_spec(agent)));
     }
-    payload.push(("observation_spec", Value::map([
-        ("primary", dimensions("image", 0, "rgb_hwc_uint8")),
-        ("language", dimensions("language", 0, "language")),
-    ])));
+    payload.push((
+        "observation_spec",
+        Value::map([
+            ("primary", dimensions("image", 0, "rgb_hwc_uint8")),
+            ("language", dimensions("language", 0, "language")),
+        ]),
+    ));
     Ok(Value::map(payload))
+}
+
+/// Arguments for the benchmark's constructor; vla-eval drops those that it does not have.
+fn observation_parameters(agent: &ServedAgent) -> Value<'static> {
+    let (height, width) = agent.info().image_size;
+    let side = |side: usize| Value::Integer(side as i128);
+    let mut parameters = vec![("image_height", side(height)), ("image_width", side(width))];
+    // A verifier looks at the gripper's position.
+    if agent.options.scorer.is_some() {
+        parameters.push(("send_state", Value::Bool(true)));
+    }
+    Value::map(parameters)
 }
 
 fn action_spec(agent: &ServedAgent) -> Value<'static> {
