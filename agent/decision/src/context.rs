@@ -20,6 +20,9 @@ pub struct EpisodeContext {
     pub sampling_seed: u64,
     /// The episode's identity, for policies that keep a state between its decisions.
     pub episode: EpisodeToken,
+    /// Seed of the policy's sampling in the next decision, where a client of a policy server gives
+    /// one; otherwise it is derived from `sampling_seed` and `step`.
+    pub decision_seed: Option<u64>,
     /// Number of control steps so far.
     pub step: u32,
     /// Object positions according to the reasoning so far.
@@ -45,6 +48,7 @@ impl EpisodeContext {
             scorer,
             sampling_seed,
             episode: EpisodeToken::new(name),
+            decision_seed: None,
             step: 0,
             tracker: ObjectTracker::default(),
             hold_still: ActionSpace::hold_still(action),
@@ -53,7 +57,7 @@ impl EpisodeContext {
 
     /// Seed of the policy's sampling at this control step.
     pub fn seed(&self) -> u64 {
-        step_seed(self.sampling_seed, self.step)
+        self.decision_seed.unwrap_or_else(|| step_seed(self.sampling_seed, self.step))
     }
 
     /// The action to execute if no candidate is well formed.

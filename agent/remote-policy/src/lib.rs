@@ -11,6 +11,7 @@ mod address;
 pub mod client;
 pub mod codec;
 pub mod profile;
+pub mod server;
 
 pub use address::{Address, Wire};
 pub use client::{ClientOptions, RemotePolicy};

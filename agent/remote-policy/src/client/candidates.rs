@@ -65,7 +65,7 @@ fn of_candidate(
             let mut parsed = parsed(profile.actions.chunk(&sent.actions)?);
             parsed.action_tokens = sent.action_tokens;
             if let Some(text) = &sent.reasoning {
-                parsed.reasoning = Reasoning::parse(text).unwrap_or_default();
+                parsed.reasoning = Reasoning::read(text);
             }
             Ok(parsed)
         }

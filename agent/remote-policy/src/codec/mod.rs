@@ -20,4 +20,4 @@ pub use value::{Key, KeyForm, Value, printable};
 pub use write::encode;
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
