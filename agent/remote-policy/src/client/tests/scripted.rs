@@ -53,12 +53,6 @@ impl Scripted {
         });
         Scripted { place, received, _runtime: runtime }
     }
-
-    /// Number of connections that sent a frame.
-    pub fn connections(&self) -> usize {
-        let received = self.received.lock().expect("not poisoned");
-        received.iter().map(|(index, _)| index + 1).max().unwrap_or(0)
-    }
 }
 
 async fn answer(
