@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use runtime::servers::{
     Host, Installation, LocalSource, Missing, PythonEnvironment, ServerProgram, Simulator,
-    development_environment, install_missing,
+    development_environment, install_missing, peers_environment,
 };
 
 /// How often a condition is checked while a test waits for it.
@@ -49,6 +49,12 @@ pub fn cargo() -> Command {
 pub fn python() -> &'static PythonEnvironment {
     static ENVIRONMENT: OnceLock<PythonEnvironment> = OnceLock::new();
     ENVIRONMENT.get_or_init(|| development_environment(&installation()).expect("Python is set up"))
+}
+
+/// Python with the environments, vla-eval and openpi-client: the peers of the policy protocols.
+pub fn peers() -> &'static PythonEnvironment {
+    static ENVIRONMENT: OnceLock<PythonEnvironment> = OnceLock::new();
+    ENVIRONMENT.get_or_init(|| peers_environment(&installation()).expect("Python is set up"))
 }
 
 /// This checkout, with the variables of this process.

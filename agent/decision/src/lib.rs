@@ -9,8 +9,10 @@
 //! Rollouts, the benchmark and the tests use it. A failure of the policy or of a scorer is a fault
 //! of the episode in which it occurred, never an outcome.
 
-// Tasks and actions.
+// Tasks, actions and seeds.
 mod action;
+mod rotation;
+mod seeds;
 mod task;
 
 // Proposals of a policy.
@@ -27,6 +29,7 @@ mod tracker;
 // The complete decision.
 mod context;
 mod decider;
+mod episode;
 
 #[cfg(any(test, feature = "scripted"))]
 pub mod scripted;
@@ -35,10 +38,13 @@ pub use action::{Action, ActionChunk, ActionSpace};
 pub use candidate::{Candidate, CandidateAction, Parsed, Proposal, ProposalRequest};
 pub use context::{EpisodeContext, step_seed};
 pub use decider::{Decider, Decision, DecisionFault, DecisionRequest};
+pub use episode::{EpisodeName, EpisodeToken, EpisodeWatch};
 pub use policy::{Policy, PolicyInfo};
 pub use protocol::message::{Image, Observation};
-pub use reasoning::{Malformed, Reasoning, TAGS, VisibleObject, last_tag};
+pub use reasoning::{Malformed, Reasoning, TAGS, Unread, VisibleObject, last_tag};
+pub use rotation::{quaternion, rotation_vector};
 pub use scorer::{Scorer, ScoringRequest, probability};
+pub use seeds::{episode_hash, episode_name, sampling_seed};
 pub use setting::Setting;
 pub use strategy::{
     Alternatives, MAJORITY_TOLERANCE_BINS, MEDOID_WEIGHT_LOGITS, Strategy, UnknownStrategy,

@@ -6,9 +6,8 @@
 
 use anyhow::Context;
 use clap::ValueEnum;
-use decision::TaskId;
+use decision::{episode_hash, episode_name, sampling_seed};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use store::plan::{EpisodePlan, OfferedTask, SEEDS_PER_RANGE, SeedRange};
 
 /// The initial layouts of the episodes.
@@ -56,29 +55,22 @@ impl Suite {
                 )
             })?),
         };
-        let place = mixed("place", task, episode, self.seed);
+        let name = episode_name(task, episode);
+        let place = episode_hash("place", &name, self.seed);
         Ok(EpisodePlan {
             task: task.clone(),
             layout,
             episode,
             seed: self.range.first() + place % SEEDS_PER_RANGE,
-            // Every reader of a record, including JavaScript, must represent this number exactly.
-            sampling_seed: mixed("sample", task, episode, self.seed) % (1 << 53),
+            sampling_seed: sampling_seed(&name, self.seed),
         })
     }
 }
 
-/// A hash that is the same on every machine and in every version of this program.
-fn mixed(purpose: &str, id: &TaskId, episode: u32, seed: u64) -> u64 {
-    let TaskId { task, variant } = id;
-    let digest = Sha256::digest(format!("{purpose}/{task}/{variant}/{episode}/{seed}"));
-    let mut bytes = [0; 8];
-    bytes.copy_from_slice(&digest[..8]);
-    u64::from_le_bytes(bytes)
-}
-
 #[cfg(test)]
 mod tests {
+    use decision::TaskId;
+
     use super::*;
 
     const TASKS: [&str; 4] = [

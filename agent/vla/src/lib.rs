@@ -25,6 +25,7 @@ mod network;
 mod generate;
 
 pub use checkpoint::completion::CompletionParser;
+pub use checkpoint::options::{LoadOptions, ReasoningMode};
 pub use generate::timings::Timings;
 pub use kernels::backend::Backend;
 pub use kernels::device::DeviceName;

@@ -1,5 +1,6 @@
 //! A checkpoint as a policy.
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
@@ -8,11 +9,13 @@ use candle_core::{Device, Tensor};
 use decision::{Candidate, Image, Policy, PolicyInfo, Proposal, ProposalRequest};
 
 use crate::checkpoint::completion::CompletionParser;
+use crate::checkpoint::options::LoadOptions;
 use crate::generate::decode_loop::{Continuation, Limits};
 use crate::generate::timings::{self, Timings};
 use crate::generate::worker_pools::WorkerPools;
 use crate::kernels::backend::Backend;
 use crate::kernels::device::DeviceName;
+use crate::network::center_crop::center_crop;
 use crate::network::decoder::Wanted;
 use crate::network::forward::{Context, Network};
 use crate::network::trace::Trace;
@@ -28,15 +31,20 @@ pub struct Vla {
 impl Vla {
     /// Loads a checkpoint folder onto a device: config.json, model.safetensors (or shards),
     /// tokenizer.json.
-    pub fn load(directory: &Path, device: DeviceName) -> Result<Vla> {
+    pub fn load(directory: &Path, device: DeviceName, options: &LoadOptions) -> Result<Vla> {
         let device = device.open()?;
-        Vla::load_on(directory, &device, Backend::for_device(&device))
+        Vla::load_on(directory, &device, Backend::for_device(&device), options)
     }
 
     /// Loads a checkpoint folder onto an open device, with the given backend.
-    pub fn load_on(directory: &Path, device: &Device, backend: Backend) -> Result<Vla> {
+    pub fn load_on(
+        directory: &Path,
+        device: &Device,
+        backend: Backend,
+        options: &LoadOptions,
+    ) -> Result<Vla> {
         let load = || -> Result<Vla> {
-            let parser = CompletionParser::load(directory)?;
+            let parser = CompletionParser::load(directory, options)?;
             let network = Network::load(directory, &parser.config, device, backend)?;
             tracing::debug!(
                 dead_weights = network.dead_weights,
@@ -68,11 +76,13 @@ impl Vla {
         }
         let prompts = requests.iter().map(|request| self.check(request));
         let prompts: Vec<Vec<u32>> = prompts.collect::<Result<_>>()?;
+        let images = self.images(requests.iter().map(|request| request.image));
         let sessions: Vec<Continuation<'_>> = requests
             .iter()
             .zip(&prompts)
-            .map(|(request, ids)| Continuation {
-                context: Context { image: request.image, ids },
+            .zip(&images)
+            .map(|((request, ids), image)| Continuation {
+                context: Context { image, ids },
                 candidates: request.candidates,
                 temperature: request.temperature,
                 seed: request.seed,
@@ -83,6 +93,7 @@ impl Vla {
             bins: &self.parser.bins,
             vocabulary: self.parser.config.vocabulary,
             end: self.parser.config.text.eos_token_id,
+            action_ends: !self.parser.config.reasoning,
         };
         let completions = self.pools.complete(&self.network, &sessions, &limits)?;
         let mut proposals: Vec<Proposal> =
@@ -106,7 +117,8 @@ impl Vla {
     pub fn activations(&self, image: &Image, ids: &[u32]) -> Result<Vec<(String, Tensor)>> {
         self.check_image(image)?;
         let mut trace = Trace::on();
-        let contexts = [Context { image, ids }];
+        let images = self.images([image].into_iter());
+        let contexts = [Context { image: &images[0], ids }];
         let (_, hidden) = self.network.prefill(&contexts, Wanted::All, &mut trace)?;
         trace.record(|| "logits".to_string(), &self.network.decoder.logits(&hidden)?);
         Ok(trace.into_outputs()?)
@@ -117,11 +129,9 @@ impl Vla {
     pub fn time(&self, requests: &[ProposalRequest<'_>], tokens: usize) -> Result<Timings> {
         let prompts = requests.iter().map(|request| self.check(request));
         let prompts: Vec<Vec<u32>> = prompts.collect::<Result<_>>()?;
-        let contexts: Vec<Context<'_>> = requests
-            .iter()
-            .zip(&prompts)
-            .map(|(request, ids)| Context { image: request.image, ids })
-            .collect();
+        let images = self.images(requests.iter().map(|request| request.image));
+        let contexts: Vec<Context<'_>> =
+            images.iter().zip(&prompts).map(|(image, ids)| Context { image, ids }).collect();
         let candidates = requests.first().map_or(1, |request| request.candidates);
         timings::measure(&self.network, &contexts, candidates, tokens)
     }
@@ -136,6 +146,15 @@ impl Vla {
         let side = self.parser.config.towers[0].side();
         let room = self.network.decoder.positions_max().saturating_sub(prompt_ids + side * side);
         self.parser.config.completion_tokens_max.min(room)
+    }
+
+    /// The images as the network sees them.
+    fn images<'a>(&self, images: impl Iterator<Item = &'a Image>) -> Vec<Cow<'a, Image>> {
+        let seen = |image: &'a Image| match self.parser.config.center_crop {
+            true => Cow::Owned(center_crop(image)),
+            false => Cow::Borrowed(image),
+        };
+        images.map(seen).collect()
     }
 
     /// Checks a request and returns its prompt.
@@ -177,5 +196,9 @@ impl Policy for Vla {
     /// Computes in the calling thread: on all cores, or on one core if other calls are running.
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
         self.propose_now(requests)
+    }
+
+    fn text(&self, candidate: &Candidate) -> Option<String> {
+        Some(self.parser.text(&candidate.tokens))
     }
 }

@@ -12,8 +12,10 @@ mod evaluate;
 mod list;
 mod names;
 mod policy;
+mod policy_server;
 mod report;
 mod selection;
+mod serve_policy;
 mod show;
 mod train;
 
@@ -71,6 +73,7 @@ enum Command {
     Show(show::Arguments),
     List(list::Arguments),
     Doctor(doctor::Arguments),
+    ServePolicy(serve_policy::Arguments),
     Bench(bench::Arguments),
     Conformance(conformance::Arguments),
     Digest(digest::Arguments),
@@ -114,6 +117,7 @@ impl Program {
             Command::Show(arguments) => show::run(&arguments, output),
             Command::List(arguments) => list::run(arguments, host),
             Command::Doctor(arguments) => doctor::run(arguments, host),
+            Command::ServePolicy(arguments) => serve_policy::run(arguments, host, output),
             Command::Bench(arguments) => bench::run(arguments, host),
             Command::Conformance(arguments) => conformance::run(arguments, host),
             Command::Digest(arguments) => digest::run(arguments),

@@ -12,13 +12,14 @@
 //! batch. A failed attempt is dropped, recorded as a fault and repeated; only an episode that ended
 //! is recorded.
 
-mod batcher;
 mod episode;
+mod first_decisions;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::{Context, Result};
+use batching::DecisionBatcher;
 use decision::{Decider, Scorer};
 use store::queue::{Disposition, EpisodeQueue, Lease};
 use store::record::{EpisodeRecord, Versions};
@@ -30,8 +31,9 @@ use crate::fault::AttemptFault;
 use crate::session::{Session, SessionInfo, SessionPool, SessionRequest};
 use crate::sinks::{Event, Sinks};
 use crate::stop::{Stop, asked};
-use batcher::DecisionBatcher;
 use episode::EpisodeRun;
+use first_decisions::FirstDecisions;
+pub use first_decisions::{NeverWellFormed, first_malformed};
 
 /// Optional content of records.
 #[derive(Debug, Clone, Copy, Default)]
@@ -75,6 +77,7 @@ impl<P: SessionPool> Rollout<P> {
         let shared = Arc::new(Shared {
             rollout: self,
             batcher,
+            first_decisions: FirstDecisions::new(),
             active,
             leased: AtomicUsize::new(0),
             returned: Notify::new(),
@@ -105,6 +108,7 @@ impl<P: SessionPool> Rollout<P> {
 struct Shared<P> {
     rollout: Rollout<P>,
     batcher: DecisionBatcher,
+    first_decisions: FirstDecisions,
     /// Number of episodes between reset and end.
     active: Arc<AtomicUsize>,
     /// Number of leases held by workers.
@@ -165,6 +169,10 @@ impl<P: SessionPool> Shared<P> {
                 pool.release(Session { info, environment });
                 queue.complete(lease).await
             }
+            Err(AttemptFault::NeverWellFormed(fault)) => {
+                self.note_fault(lease, &info, fault.clone().into()).await?;
+                Err(fault.into())
+            }
             Err(fault) => self.note_fault(lease, &info, fault).await,
         }
     }
@@ -178,7 +186,8 @@ impl<P: SessionPool> Shared<P> {
             lease,
             options: self.rollout.options,
             versions: &self.rollout.versions,
-            policy: self.rollout.decider.policy().info(),
+            policy: self.rollout.decider.policy().as_ref(),
+            first_decisions: &self.first_decisions,
             scorer: self.rollout.scorer.borrow().clone(),
             batcher: &self.batcher,
             sinks: &self.rollout.sinks,

@@ -28,8 +28,8 @@ pub use local::{LocalServerOptions, LocalServers};
 pub use native::libmujoco;
 pub use program::{ServerProgram, Simulator};
 pub use python::{
-    PythonEnvironment, development_environment, named_environment, servers_environment,
-    simulators_environment,
+    PythonEnvironment, development_environment, named_environment, peers_environment,
+    servers_environment, simulators_environment,
 };
 pub use source::{Deployment, LocalSource, ServerSource};
 pub use system_packages::{GL_PACKAGES, install_missing};

@@ -18,6 +18,7 @@ use super::{variables, wheel};
 const SERVERS_LOCK: &str = "requirements.lock";
 const SIMULATORS_LOCK: &str = "requirements-simulators.lock";
 const DEVELOPMENT_LOCK: &str = "requirements-development.lock";
+const PEERS_LOCK: &str = "requirements-peers.lock";
 /// How much of a failed command's output an error repeats.
 const OUTPUT_LINES_MAX: usize = 15;
 /// Renders what a server renders; an image of one colour was not rendered.
@@ -115,7 +116,7 @@ pub fn servers_environment(
     {
         return Ok(environment);
     }
-    environment_with(installation, "", &[SERVERS_LOCK], missing)
+    environment_with(installation, "", &[server_lock(installation, SERVERS_LOCK)], missing)
 }
 
 /// A Python apart from the servers' own, with robosuite, Gymnasium's environments and gymnasium-robotics: robosuite's
@@ -124,12 +125,25 @@ pub fn simulators_environment(
     installation: &Installation,
     missing: Missing,
 ) -> Result<PythonEnvironment> {
-    environment_with(installation, "simulators", &[SIMULATORS_LOCK], missing)
+    let lock = server_lock(installation, SIMULATORS_LOCK);
+    environment_with(installation, "simulators", &[lock], missing)
 }
 
 /// Like [`servers_environment`], with the tools that only the tests need.
 pub fn development_environment(installation: &Installation) -> Result<PythonEnvironment> {
-    environment_with(installation, "", &[SERVERS_LOCK, DEVELOPMENT_LOCK], Missing::Install)
+    let locks = [SERVERS_LOCK, DEVELOPMENT_LOCK].map(|lock| server_lock(installation, lock));
+    environment_with(installation, "", &locks, Missing::Install)
+}
+
+/// A Python apart from the servers' own, with the environments, vla-eval and openpi-client: the programs that tests run
+/// against rever. Only a checkout has the list of its packages.
+pub fn peers_environment(installation: &Installation) -> Result<PythonEnvironment> {
+    let lock = installation.root.join("tests").join(PEERS_LOCK);
+    environment_with(installation, "peers", &[lock], Missing::Install)
+}
+
+fn server_lock(installation: &Installation, name: &str) -> PathBuf {
+    installation.package_root().join(name)
 }
 
 /// A Python of the user's, which has the packages already; an error says which it lacks, and how to install them.
@@ -178,15 +192,13 @@ pub fn named_environment(
 fn environment_with(
     installation: &Installation,
     name: &str,
-    locks: &[&str],
+    locks: &[PathBuf],
     missing: Missing,
 ) -> Result<PythonEnvironment> {
-    let files: Vec<PathBuf> =
-        locks.iter().map(|lock| installation.package_root().join(lock)).collect();
-    let digests: Vec<String> = files.iter().map(|file| digest_of(file)).collect::<Result<_>>()?;
+    let digests: Vec<String> = locks.iter().map(|lock| digest_of(lock)).collect::<Result<_>>()?;
     let folder = installation.environment_folder(name, digests.first().context("no packages")?);
     let environment = PythonEnvironment::new(folder.join("bin/python"), installation, missing);
-    for (lock, digest) in files.iter().zip(&digests) {
+    for (lock, digest) in locks.iter().zip(&digests) {
         let list = PackageList { installation, environment: &environment, folder: &folder, lock };
         match missing {
             Missing::Report => list.compare()?,

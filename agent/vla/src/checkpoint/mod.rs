@@ -5,6 +5,7 @@ pub mod completion;
 pub mod confidence;
 pub mod config;
 pub mod identity;
+pub mod options;
 pub mod parse;
 pub mod prompt;
 pub mod weights;

@@ -1,6 +1,6 @@
 //! Batches decisions: all episodes that are ready share one forward pass of the policy.
 //!
-//! No episode waits for another one's server. While a batch is computed, the episodes of the
+//! No episode waits for another one's simulator or client. While a batch is computed, the episodes of the
 //! previous batch execute their steps. A batch waits for its share of the running episodes, but
 //! only for a short time.
 
@@ -54,7 +54,7 @@ impl DecisionBatcher {
         DecisionBatcher { waiting }
     }
 
-    /// Waits for a decision; `None` if the rollout has ended.
+    /// Waits for a decision; `None` if the background task has ended or the decision panicked.
     pub async fn decide(
         &self,
         observation: Observation,
