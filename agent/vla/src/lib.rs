@@ -25,10 +25,12 @@ mod network;
 mod generate;
 
 pub use checkpoint::completion::CompletionParser;
+pub use checkpoint::weights::Loaded;
 pub use generate::timings::Timings;
 pub use kernels::backend::Backend;
 pub use kernels::device::DeviceName;
-pub use policy::Vla;
+pub use kernels::matmul::WeightFormat;
+pub use policy::{LoadOptions, Vla};
 
 #[cfg(test)]
 mod tests;

@@ -7,8 +7,10 @@ use decision::{ActionSpace, Malformed, Parsed};
 
 use super::actions::ActionBins;
 use super::config::{ACTION_LENGTH, Config};
-use super::identity::identity;
+use super::digest_cache::DigestCache;
+use super::identity::Fingerprint;
 use super::prompt::Prompter;
+use super::shards::Shards;
 use super::{confidence, parse};
 
 /// Everything in a checkpoint's configuration and tokenizer that is needed to parse completions.
@@ -16,7 +18,7 @@ pub struct CompletionParser {
     pub(crate) config: Config,
     pub(crate) prompter: Prompter,
     pub(crate) bins: ActionBins,
-    digest: String,
+    pub(crate) digest: String,
 }
 
 impl CompletionParser {
@@ -24,14 +26,30 @@ impl CompletionParser {
     /// identity.
     pub fn load(directory: &Path) -> Result<CompletionParser> {
         let load = || -> Result<CompletionParser> {
-            let config = Config::load(&directory.join("config.json"))?;
-            let prompter = Prompter::load(&directory.join("tokenizer.json"), &config)?;
-            let scale = config.action_scale.clone();
-            let bins = ActionBins::new(config.vocabulary, config.action_bins, scale);
-            let digest = identity(directory, &config)?;
-            Ok(CompletionParser { config, prompter, bins, digest })
+            let mut parser = CompletionParser::open(directory)?;
+            let fingerprint = Fingerprint::of(directory, &parser.config)?;
+            let cache = DigestCache::open(directory, None)?;
+            parser.digest = match cache.digest(&fingerprint) {
+                Some(digest) => digest,
+                None => {
+                    let shards = Shards::open(directory)?;
+                    let digest = fingerprint.identity(&shards, &parser.config)?;
+                    cache.keep(&fingerprint, &digest);
+                    digest
+                }
+            };
+            Ok(parser)
         };
         load().with_context(|| format!("cannot load the policy in {}", directory.display()))
+    }
+
+    /// Loads config.json and tokenizer.json; the identity is filled in by the caller.
+    pub(crate) fn open(directory: &Path) -> Result<CompletionParser> {
+        let config = Config::load(&directory.join("config.json"))?;
+        let prompter = Prompter::load(&directory.join("tokenizer.json"), &config)?;
+        let scale = config.action_scale.clone();
+        let bins = ActionBins::new(config.vocabulary, config.action_bins, scale);
+        Ok(CompletionParser { config, prompter, bins, digest: String::new() })
     }
 
     /// The checkpoint's identity: SHA-256 of its configuration, tokenizer and weights, in

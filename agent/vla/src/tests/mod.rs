@@ -1,6 +1,7 @@
 //! Tests of the whole policy: parity with PyTorch, shared prefixes, batches, seeds, refusals.
 
 mod checkpoint;
+mod loading;
 mod parity;
 mod proposal;
 
@@ -11,7 +12,8 @@ use candle_core::{DType, Device, Tensor};
 
 use decision::{Image, Policy as _};
 
-use super::{Backend, DeviceName, Vla};
+use super::{Backend, DeviceName, LoadOptions, Vla, WeightFormat};
+use crate::checkpoint::weights::Target;
 
 /// Both tiny layouts: one tower as in the shipped model, two as in OpenVLA-7B.
 const TINY: [&str; 2] = ["tiny", "tiny-fused"];
@@ -21,7 +23,8 @@ fn fixtures() -> PathBuf {
 }
 
 fn tiny(name: &str, backend: Backend) -> Result<Vla> {
-    Vla::load_on(&fixtures().join(name), &Device::Cpu, backend)
+    let target = Target { device: Device::Cpu, backend, format: WeightFormat::Exact };
+    Vla::load_on(&fixtures().join(name), target, &LoadOptions::default())
 }
 
 /// The golden tensors of one file by name.
