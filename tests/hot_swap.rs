@@ -8,7 +8,7 @@ use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
 use store::record::EpisodeRecord;
 use verifier::training::{LayoutKey, TrainingEpisode, TrainingSet, train};
 use verifier::{TrainingOptions, Verifier};
-use vla::CompletionParser;
+use vla::{CompletionParser, LoadOptions};
 
 use crate::evaluation::{Evaluation, WAIT};
 use crate::harness::{repository, wait_for};
@@ -23,7 +23,7 @@ const ACTION_LENGTH: usize = 7;
 async fn a_published_verifier_is_used_from_the_next_episode_on() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = repository().join("agent/models/bridge-small");
-    let policy = CompletionParser::load(&model).expect("a policy");
+    let policy = CompletionParser::load(&model, &LoadOptions::default()).expect("a policy");
     let (first, second) = (verifier(policy.digest(), 1), verifier(policy.digest(), 2));
     let path = folder.path().join("first.safetensors");
     std::fs::write(&path, first.bytes()).expect("the first verifier is written");
@@ -54,7 +54,7 @@ async fn a_published_verifier_is_used_from_the_next_episode_on() {
 async fn a_verifier_of_another_policy_is_not_used() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = repository().join("agent/models/bridge-small");
-    let policy = CompletionParser::load(&model).expect("a policy");
+    let policy = CompletionParser::load(&model, &LoadOptions::default()).expect("a policy");
     let (foreign, fitting) = (verifier(&"0".repeat(64), 1), verifier(policy.digest(), 2));
     let endpoint = free_endpoint();
     let evaluation = evaluation(folder.path(), &endpoint, &[]);

@@ -39,6 +39,9 @@ mod command_line;
 // Evaluations with the shipped models: results, killed processes, faults, the report.
 mod whole_loop;
 
+// Policies other than the included one.
+mod any_policy;
+
 // The page of a run in a browser.
 mod report_page;
 

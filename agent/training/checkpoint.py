@@ -98,6 +98,8 @@ def config_json(
         "torch_dtype": str(dtype).removeprefix("torch."),
         "prompt_template": PROMPT_TEMPLATE,
         "reasoning": True,
+        # Its reasoning has one form: a text in another form is refused with its action.
+        "reasoning_strict": True,
         "unnorm_key": DATASET,
         "norm_stats": {DATASET: {"action": statistics.to_json()}},
     }

@@ -37,7 +37,7 @@ pub use context::{EpisodeContext, step_seed};
 pub use decider::{Decider, Decision, DecisionFault, DecisionRequest};
 pub use policy::{Policy, PolicyInfo};
 pub use protocol::message::{Image, Observation};
-pub use reasoning::{Malformed, Reasoning, TAGS, VisibleObject, last_tag};
+pub use reasoning::{Malformed, Reasoning, TAGS, Unread, VisibleObject, last_tag};
 pub use scorer::{Scorer, ScoringRequest, probability};
 pub use setting::Setting;
 pub use strategy::{

@@ -3,7 +3,7 @@
 use anyhow::Result;
 use async_trait::async_trait;
 
-use crate::{ActionSpace, Proposal, ProposalRequest};
+use crate::{ActionSpace, Candidate, Proposal, ProposalRequest};
 
 /// What other components need to know about a policy.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,4 +31,9 @@ pub trait Policy: Send + Sync {
 
     /// Samples candidates for all requests; returns one proposal per request, in the same order.
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>>;
+
+    /// The text of a candidate, if the policy writes one.
+    fn text(&self, _candidate: &Candidate) -> Option<String> {
+        None
+    }
 }

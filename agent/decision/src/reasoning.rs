@@ -1,7 +1,11 @@
-//! The chain of thought as data. The parser is strict: each of ECoT's tags must occur exactly once
-//! and in order.
+//! The chain of thought as data. [`Reasoning::parse`] is strict: each of ECoT's tags must occur
+//! exactly once and in order. [`Reasoning::read`] takes what is there.
+
+mod partial;
 
 use std::fmt;
+
+pub use partial::Unread;
 
 /// ECoT's tags in order. `ACTION:` ends the text; action tokens follow it.
 pub const TAGS: [&str; 9] = [
@@ -40,6 +44,8 @@ pub struct Reasoning {
     /// Pixel coordinates (x, y) in an image of 256 x 256 pixels: the gripper's position and, in
     /// ECoT, its future positions.
     pub gripper_position: Vec<[u16; 2]>,
+    /// The sections that were not read, or not completely. Empty for a text in ECoT's form.
+    pub unread: Vec<Unread>,
 }
 
 /// An object and its bounding box in an image of 256 x 256 pixels.
@@ -87,6 +93,7 @@ impl Reasoning {
             move_reasoning: move_reasoning.to_string(),
             movement: movement.to_string(),
             gripper_position: gripper_position(gripper)?,
+            unread: Vec::new(),
         })
     }
 }
@@ -235,6 +242,7 @@ mod tests {
             move_reasoning: "the gripper must go there".to_string(),
             movement: "move left down".to_string(),
             gripper_position: vec![[120, 84]],
+            unread: Vec::new(),
         };
         assert_eq!(Reasoning::parse(GOOD), Ok(expected));
     }

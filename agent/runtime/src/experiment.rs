@@ -16,7 +16,7 @@ use thiserror::Error;
 use tokio::runtime::Runtime;
 use tokio::sync::watch;
 
-use crate::rollout::{RecordOptions, Rollout};
+use crate::rollout::{NeverWellFormed, RecordOptions, Rollout};
 use crate::servers::Deployment;
 use crate::sinks::{EventSink, OutcomeSink, Progress, Sinks, StoreSink, VideoSink};
 use crate::stop::{self, Stop};
@@ -114,8 +114,12 @@ impl Experiment {
             let deployment = deploy()?;
             let result = runtime.block_on(self.roll_out(&deployment, run, Arc::clone(&queue)));
             let closed = deployment.close(runtime);
-            was_stopped = result.with_context(|| {
-                format!("rerun the same command to resume {}", folder.display())
+            was_stopped = result.map_err(|error| match error.is::<NeverWellFormed>() {
+                // The same command would end in the same way.
+                true => error,
+                false => {
+                    error.context(format!("rerun the same command to resume {}", folder.display()))
+                }
             })?;
             closed?;
         }

@@ -7,6 +7,8 @@ use protocol::{CodecError, FaultKind, transport};
 use store::queue::FaultScope;
 use thiserror::Error;
 
+use crate::rollout::NeverWellFormed;
+
 /// A fault of the environment or of the connection to it. The episode is void after every fault
 /// except [`EnvironmentFault::Refused`], which leaves the environment unchanged.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -103,6 +105,9 @@ pub enum AttemptFault {
     /// The policy or the scorer failed.
     #[error("{0}")]
     Decision(#[from] DecisionFault),
+    /// No candidate of the policy was ever well formed; the run ends.
+    #[error("{0}")]
+    NeverWellFormed(#[from] NeverWellFormed),
     /// The rollout was stopped during the attempt.
     #[error("stopped")]
     Stopped,
@@ -121,7 +126,7 @@ impl AttemptFault {
                 | EnvironmentFault::Wire { .. } => FaultScope::Server,
                 EnvironmentFault::LinkLost { .. } => FaultScope::Link,
             },
-            AttemptFault::Decision(_) => FaultScope::Episode,
+            AttemptFault::Decision(_) | AttemptFault::NeverWellFormed(_) => FaultScope::Episode,
             AttemptFault::Stopped => FaultScope::Link,
         }
     }

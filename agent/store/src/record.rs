@@ -102,6 +102,10 @@ pub struct CandidateRecord {
     pub actions: Option<ActionChunk>,
     /// The reason why it is malformed.
     pub malformed: Option<String>,
+    /// The sections of its reasoning that were only partly read, with reasons. Absent if there are
+    /// none, as in every record of a policy whose reasoning is read strictly.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub unread: Vec<String>,
     /// The verifier's success probability.
     pub score: Option<f32>,
     /// Log-probability of the sampled tokens at temperature 1.
@@ -173,6 +177,7 @@ pub(crate) mod tests {
             tokens: vec![7, 400, 65_000],
             actions: Some(chunk()),
             malformed: None,
+            unread: Vec::new(),
             score: Some(0.75),
             log_probability: -3.5,
             log_probabilities: vec![-1.0, -2.0, -0.5],
@@ -181,6 +186,7 @@ pub(crate) mod tests {
         let malformed = CandidateRecord {
             actions: None,
             malformed: Some("expected 7 action tokens, got 6".into()),
+            unread: Vec::new(),
             score: None,
             hidden: None,
             ..candidate.clone()

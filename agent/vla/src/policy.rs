@@ -1,16 +1,18 @@
 //! A checkpoint as a policy.
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 use async_trait::async_trait;
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use decision::{Candidate, Image, Policy, PolicyInfo, Proposal, ProposalRequest};
 
 use crate::checkpoint::completion::CompletionParser;
-use crate::checkpoint::config::TowerConfig;
+use crate::checkpoint::config::{Config, TowerConfig};
 use crate::checkpoint::digest_cache::DigestCache;
 use crate::checkpoint::identity::{Fingerprint, used_tensors};
+use crate::checkpoint::options::LoadOptions;
 use crate::checkpoint::shards::Shards;
 use crate::checkpoint::weights::{Loaded, Target, Weights};
 use crate::generate::decode_loop::{Continuation, Limits};
@@ -19,6 +21,7 @@ use crate::generate::worker_pools::WorkerPools;
 use crate::kernels::backend::Backend;
 use crate::kernels::device::DeviceName;
 use crate::kernels::matmul::WeightFormat;
+use crate::network::center_crop::center_crop;
 use crate::network::decoder::Wanted;
 use crate::network::forward::{Context, Network};
 use crate::network::trace::Trace;
@@ -34,9 +37,9 @@ pub struct Vla {
     info: PolicyInfo,
 }
 
-/// How to load a checkpoint.
+/// Where and how the weights of a checkpoint are loaded.
 #[derive(Clone, Copy)]
-pub struct LoadOptions<'a> {
+pub struct Loading<'a> {
     /// The device of the network.
     pub device: DeviceName,
     /// The format of the decoder's matrices.
@@ -47,9 +50,9 @@ pub struct LoadOptions<'a> {
     pub report: &'a dyn Fn(Loaded),
 }
 
-impl Default for LoadOptions<'_> {
+impl Default for Loading<'_> {
     fn default() -> Self {
-        LoadOptions {
+        Loading {
             device: DeviceName::Cpu,
             weights: WeightFormat::Exact,
             digests: None,
@@ -61,33 +64,49 @@ impl Default for LoadOptions<'_> {
 impl Vla {
     /// Loads a checkpoint folder onto a device: config.json, model.safetensors (or shards),
     /// tokenizer.json.
-    pub fn load(directory: &Path, device: DeviceName) -> Result<Vla> {
-        Vla::load_with(directory, &LoadOptions { device, ..LoadOptions::default() })
+    pub fn load(directory: &Path, device: DeviceName, options: &LoadOptions) -> Result<Vla> {
+        Vla::load_with(directory, options, &Loading { device, ..Loading::default() })
     }
 
     /// Loads a checkpoint folder. Tensors are read one at a time, and hashed while the network is
     /// made of them unless the digest is known.
-    pub fn load_with(directory: &Path, options: &LoadOptions<'_>) -> Result<Vla> {
-        let device = options.device.open()?;
-        let (backend, format) = (Backend::for_device(&device), options.weights);
+    pub fn load_with(
+        directory: &Path,
+        options: &LoadOptions,
+        loading: &Loading<'_>,
+    ) -> Result<Vla> {
+        let device = loading.device.open()?;
+        let (backend, format) = (Backend::for_device(&device), loading.weights);
         ensure!(
             format == WeightFormat::Exact || backend == Backend::Kernels,
-            "weights: expected 8 bits on the cpu only, got them on {}",
-            options.device
+            "weights in 8 bits: expected the device cpu, got {}",
+            loading.device
         );
-        Vla::load_on(directory, Target { device, backend, format }, options)
+        Vla::load_onto(directory, options, Target { device, backend, format }, loading)
     }
 
     /// Loads a checkpoint folder onto an open device, with the given backend.
-    pub(crate) fn load_on(
+    pub fn load_on(
         directory: &Path,
+        device: &Device,
+        backend: Backend,
+        options: &LoadOptions,
+    ) -> Result<Vla> {
+        let target = Target { device: device.clone(), backend, format: WeightFormat::Exact };
+        Vla::load_onto(directory, options, target, &Loading::default())
+    }
+
+    pub(crate) fn load_onto(
+        directory: &Path,
+        options: &LoadOptions,
         target: Target,
-        options: &LoadOptions<'_>,
+        loading: &Loading<'_>,
     ) -> Result<Vla> {
         let load = || -> Result<Vla> {
-            let mut parser = CompletionParser::open(directory)?;
+            let none = |_: &Config| Ok(String::new());
+            let mut parser = CompletionParser::load_with(directory, options, none)?;
             let fingerprint = Fingerprint::of(directory, &parser.config)?;
-            let cache = DigestCache::open(directory, options.digests)?;
+            let cache = DigestCache::open(directory, loading.digests)?;
             let shards = Shards::open(directory)?;
             let known = cache.digest(&fingerprint);
             let hashing = match known {
@@ -96,7 +115,7 @@ impl Vla {
             };
             let used = used_tensors(&shards, &parser.config);
             let backend = target.backend;
-            let weights = Weights::new(&shards, &used, hashing, target, options.report);
+            let weights = Weights::new(&shards, &used, hashing, target, loading.report);
             let (network, rest) = Network::load(weights, &parser.config)?;
             if let Some(digest) = &rest.digest {
                 cache.keep(&fingerprint, digest);
@@ -133,11 +152,13 @@ impl Vla {
         }
         let prompts = requests.iter().map(|request| self.check(request));
         let prompts: Vec<Vec<u32>> = prompts.collect::<Result<_>>()?;
+        let images = self.images(requests.iter().map(|request| request.image));
         let sessions: Vec<Continuation<'_>> = requests
             .iter()
             .zip(&prompts)
-            .map(|(request, ids)| Continuation {
-                context: Context { image: request.image, ids },
+            .zip(&images)
+            .map(|((request, ids), image)| Continuation {
+                context: Context { image, ids },
                 candidates: request.candidates,
                 temperature: request.temperature,
                 seed: request.seed,
@@ -148,6 +169,7 @@ impl Vla {
             bins: &self.parser.bins,
             vocabulary: self.parser.config.vocabulary,
             end: self.parser.config.text.eos_token_id,
+            action_ends: !self.parser.config.reasoning,
         };
         let completions = self.pools.complete(&self.network, &sessions, &limits)?;
         let mut proposals: Vec<Proposal> =
@@ -171,7 +193,8 @@ impl Vla {
     pub fn activations(&self, image: &Image, ids: &[u32]) -> Result<Vec<(String, Tensor)>> {
         self.check_image(image)?;
         let mut trace = Trace::on();
-        let contexts = [Context { image, ids }];
+        let images = self.images([image].into_iter());
+        let contexts = [Context { image: &images[0], ids }];
         let (_, hidden) = self.network.prefill(&contexts, Wanted::All, &mut trace)?;
         trace.record(|| "logits".to_string(), &self.network.decoder.logits(&hidden)?);
         Ok(trace.into_outputs()?)
@@ -182,11 +205,9 @@ impl Vla {
     pub fn time(&self, requests: &[ProposalRequest<'_>], tokens: usize) -> Result<Timings> {
         let prompts = requests.iter().map(|request| self.check(request));
         let prompts: Vec<Vec<u32>> = prompts.collect::<Result<_>>()?;
-        let contexts: Vec<Context<'_>> = requests
-            .iter()
-            .zip(&prompts)
-            .map(|(request, ids)| Context { image: request.image, ids })
-            .collect();
+        let images = self.images(requests.iter().map(|request| request.image));
+        let contexts: Vec<Context<'_>> =
+            images.iter().zip(&prompts).map(|(image, ids)| Context { image, ids }).collect();
         let candidates = requests.first().map_or(1, |request| request.candidates);
         timings::measure(&self.network, &contexts, candidates, tokens)
     }
@@ -210,6 +231,15 @@ impl Vla {
         let side = self.parser.config.towers[0].side();
         let room = self.network.decoder.positions_max().saturating_sub(prompt_ids + side * side);
         self.parser.config.completion_tokens_max.min(room)
+    }
+
+    /// The images as the network sees them.
+    fn images<'a>(&self, images: impl Iterator<Item = &'a Image>) -> Vec<Cow<'a, Image>> {
+        let seen = |image: &'a Image| match self.parser.config.center_crop {
+            true => Cow::Owned(center_crop(image)),
+            false => Cow::Borrowed(image),
+        };
+        images.map(seen).collect()
     }
 
     /// Checks a request and returns its prompt.
@@ -251,5 +281,9 @@ impl Policy for Vla {
     /// Computes in the calling thread: on all cores, or on one core if other calls are running.
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
         self.propose_now(requests)
+    }
+
+    fn text(&self, candidate: &Candidate) -> Option<String> {
+        Some(self.parser.text(&candidate.tokens))
     }
 }

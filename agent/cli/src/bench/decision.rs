@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use decision::{
-    Decider, DecisionRequest, EpisodeContext, Observation, Policy, ProposalRequest, Scorer,
-    Setting as EpisodeSetting, Strategy,
+    ActionSpace, Decider, DecisionRequest, EpisodeContext, Observation, Policy, ProposalRequest,
+    Scorer, Setting as EpisodeSetting, Strategy,
 };
 use evaluation::statistics::quantile;
 use protocol::Dimension;
@@ -39,10 +39,9 @@ pub struct Row {
     /// The setting.
     #[serde(flatten)]
     pub setting: Setting,
-    /// Time of prefill (image and prompt): the fastest observation.
-    pub prefill_ms: f64,
-    /// Time of a decoding step, one token of every candidate: the fastest observation.
-    pub step_ms: f64,
+    /// What only a local checkpoint has.
+    #[serde(flatten)]
+    pub network: Option<NetworkRow>,
     /// Tokens of all candidates of a decision, mean.
     pub tokens: f64,
     /// Time of a decision (prefill, decode, parse, score, choose), median.
@@ -51,6 +50,15 @@ pub struct Row {
     pub decision_ms_p95: f64,
     /// Tokens of all candidates divided by the time of the whole decision.
     pub tokens_per_second: f64,
+}
+
+/// The times of the network in one setting.
+#[derive(Debug, Clone, Serialize)]
+pub struct NetworkRow {
+    /// Time of prefill (image and prompt): the fastest observation.
+    pub prefill_ms: f64,
+    /// Time of a decoding step, one token of every candidate: the fastest observation.
+    pub step_ms: f64,
     /// Bytes of weights that a step reads.
     pub weight_bytes: usize,
     /// Bandwidth of a step, as a share of that at which this machine reads a buffer of the same size.
@@ -75,9 +83,11 @@ pub struct Comparison {
 pub struct Report {
     /// The results of rever, one row per setting; the first is greedy.
     pub rows: Vec<Row>,
-    /// Bandwidth at which all threads read a buffer as large as a step's weights.
-    pub bandwidth_bytes_per_second: f64,
-    /// Median time of five verified candidates divided by that of one greedy candidate.
+    /// Bandwidth at which all threads read a buffer as large as a step's weights; of a local checkpoint.
+    pub bandwidth_bytes_per_second: Option<f64>,
+    /// The strategy that compares the candidates: `verifier`, or `medoid` without a verifier.
+    pub strategy: String,
+    /// Median time of five compared candidates divided by that of one greedy candidate.
     pub ratio_greedy: f64,
     /// Time of eager PyTorch divided by that of rever, at five candidates; only with a comparison.
     pub ratio_eager: Option<f64>,
@@ -93,16 +103,18 @@ pub struct Report {
     pub decisions: usize,
     /// Digest of the policy.
     pub policy: String,
-    /// Digest of the verifier.
-    pub verifier: String,
+    /// Digest of the verifier, if there is one.
+    pub verifier: Option<String>,
 }
 
 /// The parameters of the benchmark.
 pub struct DecisionBench<'a> {
     /// The policy that proposes candidates.
-    pub policy: Arc<Vla>,
-    /// The verifier that scores them.
-    pub verifier: Arc<Verifier>,
+    pub policy: Arc<dyn Policy>,
+    /// The same policy, if it is a local checkpoint: its prefill and steps are timed, too.
+    pub checkpoint: Option<Arc<Vla>>,
+    /// The verifier that scores them, if there is one; without it the medoid is executed.
+    pub verifier: Option<Arc<Verifier>>,
     /// The observations to decide on, one after the other.
     pub observations: &'a [Observation],
     /// Counted passes over all observations.
@@ -116,7 +128,7 @@ impl DecisionBench<'_> {
     pub fn run(&self, mut torch: Option<Torch>, mut progress: impl FnMut(usize)) -> Result<Report> {
         ensure!(self.rounds > 0, "rounds: expected at least 1, got 0");
         let settings = settings();
-        let decider = Decider::new(Arc::clone(&self.policy) as Arc<dyn Policy>);
+        let decider = Decider::new(Arc::clone(&self.policy));
         let hello = torch.as_ref().map(|torch| torch.hello.clone());
         let torch_settings = hello.as_ref().map(|hello| hello.settings.clone()).unwrap_or_default();
         let mut ours: Vec<Samples> = settings.iter().map(|_| Samples::default()).collect();
@@ -168,18 +180,19 @@ impl DecisionBench<'_> {
         setting: Setting,
         seed: u64,
     ) -> Result<(f64, Vec<Vec<u32>>)> {
-        // Greedy decoding does not use the verifier.
-        let scorer = Arc::clone(&self.verifier) as Arc<dyn Scorer>;
+        let scorer = self.verifier.clone().map(|verifier| verifier as Arc<dyn Scorer>);
         let (strategy, scorer) = match setting.temperature {
+            // Greedy decoding does not use the verifier.
             0.0 => (Strategy::Greedy, None),
-            _ => (Strategy::Verifier, Some(scorer)),
+            _ => (compared(scorer.is_some()), scorer),
         };
         let Setting { candidates, temperature } = setting;
         let setting = EpisodeSetting { strategy, candidates: candidates as u32, temperature };
         let start = Instant::now();
         let instruction = observation.instruction.clone();
-        let mut context =
-            EpisodeContext::new(setting, seed, instruction, scorer, &[] as &[Dimension]);
+        // Without a well-formed candidate the decision is to hold still.
+        let action = dimensions(&self.policy.info().action_space);
+        let mut context = EpisodeContext::new(setting, seed, instruction, scorer, &action);
         let request = DecisionRequest { observation, context: &mut context };
         let decided = self.runtime.block_on(decider.decide(vec![request]));
         let decision = decided.into_iter().next().context("no decision")??;
@@ -194,8 +207,8 @@ impl DecisionBench<'_> {
         torch: Vec<Comparison>,
         torch_hello: Option<Hello>,
     ) -> Result<Report> {
-        let weight_bytes = self.policy.step_bytes();
-        let bandwidth = bandwidth::measure(weight_bytes);
+        let checkpoint = self.checkpoint.as_ref();
+        let bandwidth = checkpoint.map(|policy| bandwidth::measure(policy.step_bytes()));
         let rows = settings.iter().zip(samples);
         let rows = rows.map(|(setting, samples)| self.row(*setting, samples, bandwidth));
         let rows = rows.collect::<Result<Vec<Row>>>()?;
@@ -219,36 +232,52 @@ impl DecisionBench<'_> {
             torch_hello,
             threads: rayon::current_num_threads(),
             decisions: self.rounds * self.observations.len(),
-            policy: self.policy.parser().digest().to_owned(),
-            verifier: self.verifier.digest().to_owned(),
+            strategy: compared(self.verifier.is_some()).to_string(),
+            policy: self.policy.info().digest.clone(),
+            verifier: self.verifier.as_ref().map(|verifier| verifier.digest().to_owned()),
             rows,
         })
     }
 
-    fn row(&self, setting: Setting, mut samples: Samples, bandwidth: f64) -> Result<Row> {
+    fn row(&self, setting: Setting, mut samples: Samples, bandwidth: Option<f64>) -> Result<Row> {
         samples.ms.sort_by(f64::total_cmp);
         let Samples { ms, tokens } = samples;
         let seconds = ms.iter().sum::<f64>() / 1e3;
         let tokens_mean = tokens as f64 / ms.len() as f64;
         let steps = (tokens_mean / setting.candidates as f64).round() as usize;
+        let network = self.checkpoint.as_ref().zip(bandwidth).map(|(checkpoint, bandwidth)| {
+            self.network_row(checkpoint, setting, steps.max(1), bandwidth)
+        });
+        Ok(Row {
+            setting,
+            network: network.transpose()?,
+            tokens: tokens_mean,
+            decision_ms_p50: quantile(&ms, 0.5),
+            decision_ms_p95: quantile(&ms, 0.95),
+            tokens_per_second: tokens as f64 / seconds,
+        })
+    }
+
+    fn network_row(
+        &self,
+        checkpoint: &Vla,
+        setting: Setting,
+        steps: usize,
+        bandwidth: f64,
+    ) -> Result<NetworkRow> {
         let Setting { candidates, temperature } = setting;
         let (mut prefill_ms, mut step_ms) = (f64::INFINITY, f64::INFINITY);
         for Observation { image, instruction, state, .. } in self.observations {
             let request =
                 ProposalRequest { image, state, instruction, candidates, temperature, seed: 0 };
-            let timings = self.policy.time(&[request], steps.max(1))?;
+            let timings = checkpoint.time(&[request], steps)?;
             prefill_ms = prefill_ms.min(timings.prefill_ms);
             step_ms = step_ms.min(timings.step_ms);
         }
-        let weight_bytes = self.policy.step_bytes();
-        Ok(Row {
-            setting,
+        let weight_bytes = checkpoint.step_bytes();
+        Ok(NetworkRow {
             prefill_ms,
             step_ms,
-            tokens: tokens_mean,
-            decision_ms_p50: quantile(&ms, 0.5),
-            decision_ms_p95: quantile(&ms, 0.95),
-            tokens_per_second: tokens as f64 / seconds,
             weight_bytes,
             bandwidth_share: weight_bytes as f64 / (step_ms / 1e3) / bandwidth,
         })
@@ -269,6 +298,22 @@ impl Samples {
     }
 }
 
+/// An action's dimensions, as a task would describe them.
+fn dimensions(space: &ActionSpace) -> Vec<Dimension> {
+    let dimension = |index: usize| Dimension {
+        name: if space.gripper == Some(index) { "gripper" } else { "motion" }.to_owned(),
+        low: None,
+        high: None,
+        discrete: false,
+    };
+    (0..space.length()).map(dimension).collect()
+}
+
+/// The strategy that compares candidates: the verifier's, or the medoid, which needs none.
+pub fn compared(has_verifier: bool) -> Strategy {
+    if has_verifier { Strategy::Verifier } else { Strategy::Medoid }
+}
+
 /// The greedy setting first, then the sampled ones.
 fn settings() -> Vec<Setting> {
     let greedy = Setting { candidates: 1, temperature: 0.0 };
@@ -284,13 +329,14 @@ mod tests {
     use super::*;
     use crate::bench::read_observations;
     use std::path::Path;
-    use vla::DeviceName;
+    use vla::{DeviceName, LoadOptions};
 
     #[test]
     fn every_setting_is_timed_on_every_observation() {
         let agent = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("a folder");
         let model = agent.join("models/bridge-small");
-        let policy = Vla::load(&model, DeviceName::Cpu).expect("the shipped policy");
+        let policy = Vla::load(&model, DeviceName::Cpu, &LoadOptions::default())
+            .expect("the shipped policy");
         let file = model.join(crate::files::VERIFIER_FILE);
         let digest = policy.parser().digest();
         let verifier = Verifier::load(&file, digest).expect("the shipped verifier");
@@ -298,9 +344,11 @@ mod tests {
             read_observations(&agent.join("vla/tests/fixtures/bridge-small.safetensors"));
         let observations = &observations.expect("recorded ones")[..2];
         let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+        let policy = Arc::new(policy);
         let bench = DecisionBench {
-            policy: Arc::new(policy),
-            verifier: Arc::new(verifier),
+            policy: Arc::clone(&policy) as Arc<dyn Policy>,
+            checkpoint: Some(policy),
+            verifier: Some(Arc::new(verifier)),
             observations,
             rounds: 1,
             runtime: &runtime,

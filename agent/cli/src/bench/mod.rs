@@ -10,8 +10,8 @@ mod throughput;
 mod torch;
 mod wire;
 
-pub use decision::{DecisionBench, Report, Row as DecisionRow};
-pub use observations::read as read_observations;
+pub use decision::{DecisionBench, NetworkRow, Report, Row as DecisionRow};
+pub use observations::{read as read_observations, scaled};
 pub use simulators::{Row as SimulatorsRow, SimulatorsBench};
 pub use throughput::{Row as ThroughputRow, ThroughputBench};
 pub use torch::Torch;

@@ -42,6 +42,44 @@ pub fn read(file: &Path) -> Result<Vec<Observation>> {
     read().with_context(|| format!("observations in {}", file.display()))
 }
 
+/// The observations with images of this height and width, bilinearly scaled where they have another size.
+pub fn scaled(observations: Vec<Observation>, (height, width): (usize, usize)) -> Vec<Observation> {
+    let scale = |observation: Observation| {
+        let image = &observation.image;
+        if (image.height, image.width) == (height, width) {
+            return observation;
+        }
+        let mut pixels = Vec::with_capacity(height * width * 3);
+        for y in 0..height {
+            for x in 0..width {
+                let (row, column) = (place(y, height, image.height), place(x, width, image.width));
+                pixels.extend((0..3).map(|colour| blended(image, row, column, colour)));
+            }
+        }
+        let image = Image { height, width, pixels: pixels.into() };
+        Observation { image, ..observation }
+    };
+    observations.into_iter().map(scale).collect()
+}
+
+/// The two rows or columns of the image that a row or column of the result lies between, and how far.
+fn place(index: usize, size: usize, of: usize) -> (usize, usize, f32) {
+    let centre = ((index as f32 + 0.5) * of as f32 / size as f32 - 0.5).clamp(0.0, (of - 1) as f32);
+    let low = centre as usize;
+    (low, (low + 1).min(of - 1), centre - low as f32)
+}
+
+fn blended(
+    image: &Image,
+    (top, bottom, down): (usize, usize, f32),
+    (left, right, across): (usize, usize, f32),
+    colour: usize,
+) -> u8 {
+    let value = |y: usize, x: usize| f32::from(image.pixels[(y * image.width + x) * 3 + colour]);
+    let row = |y: usize| value(y, left) + (value(y, right) - value(y, left)) * across;
+    (row(top) + (row(bottom) - row(top)) * down).round() as u8
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -57,5 +95,24 @@ mod tests {
         assert_eq!(first.instruction, "put carrot on plate");
         let error = read(&fixtures.join("tiny/model.safetensors")).expect_err("no observations");
         assert!(format!("{error:#}").contains("expected metadata"), "{error:#}");
+    }
+
+    #[test]
+    fn observations_are_scaled_to_the_size_of_a_policy() {
+        // Two columns: black and white.
+        let pixels = [[0; 3], [255; 3], [0; 3], [255; 3]].concat();
+        let image = Image { height: 2, width: 2, pixels: pixels.into() };
+        let observation = Observation {
+            image,
+            state: vec![1.0],
+            instruction: "lift".into(),
+            expert_action: None,
+        };
+        let same = scaled(vec![observation.clone()], (2, 2)).remove(0);
+        assert_eq!(same, observation);
+        let wide = scaled(vec![observation], (1, 4)).remove(0);
+        let red: Vec<u8> = wide.image.pixels.iter().step_by(3).copied().collect();
+        assert_eq!(red, [0, 64, 191, 255]);
+        assert_eq!((wide.image.height, wide.image.width, &*wide.instruction), (1, 4, "lift"));
     }
 }

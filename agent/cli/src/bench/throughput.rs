@@ -20,8 +20,8 @@ use store::queue::{EpisodeQueue, RunQueue};
 use store::run::{Run, RunRequest};
 use tokio::sync::watch;
 use verifier::Verifier;
-use vla::Vla;
 
+use super::decision::compared;
 use crate::build_info;
 
 /// Control steps per session before counting starts.
@@ -48,9 +48,9 @@ pub struct Row {
 /// The parameters of the benchmark.
 pub struct ThroughputBench<'a> {
     /// The policy that proposes candidates.
-    pub policy: Arc<Vla>,
-    /// The verifier that scores them.
-    pub verifier: Arc<Verifier>,
+    pub policy: Arc<dyn Policy>,
+    /// The verifier that scores them, if there is one; without it the medoid is executed.
+    pub verifier: Option<Arc<Verifier>>,
     /// Source of the local servers.
     pub servers: &'a ServerSource,
     /// Numbers of concurrent episodes.
@@ -106,8 +106,8 @@ impl ThroughputBench<'_> {
         let counts = progress.counts();
         let (_never, stop) = watch::channel(Stop::No);
         let outcomes = OutcomePublisher::declare(&deployment.network, &name).await?;
-        let (_newer, scorer) = watch::channel(Some(Arc::clone(&self.verifier) as Arc<dyn Scorer>));
-        let policy = Arc::clone(&self.policy) as Arc<dyn Policy>;
+        let (_newer, scorer) = watch::channel(self.scorer());
+        let policy = Arc::clone(&self.policy);
         let pool = pool_options(policy.info(), name, None);
         let rollout = Rollout {
             decider: Arc::new(Decider::new(policy)),
@@ -142,6 +142,15 @@ impl ThroughputBench<'_> {
         })
     }
 
+    fn scorer(&self) -> Option<Arc<dyn Scorer>> {
+        self.verifier.clone().map(|verifier| verifier as Arc<dyn Scorer>)
+    }
+
+    /// The strategy that is timed: it compares all candidates.
+    pub fn strategy(&self) -> Strategy {
+        compared(self.verifier.is_some())
+    }
+
     /// A queue with enough episodes that no session is idle before this many decisions are made.
     fn queue(
         &self,
@@ -158,7 +167,7 @@ impl ThroughputBench<'_> {
             range: SeedRange::Tuning,
             seed: 0,
         };
-        let setting = Setting::new(Strategy::Verifier, self.candidates, 1.0);
+        let setting = Setting::new(self.strategy(), self.candidates, 1.0);
         Ok(RunQueue::new(run, &suite.episodes()?, &[setting], &BTreeSet::new()))
     }
 }

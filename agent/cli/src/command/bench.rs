@@ -1,23 +1,21 @@
 //! `rever bench`: benchmarks of decisions, episodes, the wire and simulators.
 
+mod decision;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
 use evaluation::table::aligned;
-use indicatif::{ProgressBar, ProgressStyle};
 
 use runtime::servers::{Host, LocalSource, ServerSource, Simulator};
 use verifier::Verifier;
-use vla::{DeviceName, Vla};
 
-use crate::bench::{
-    self, DecisionBench, Report, SimulatorsBench, ThroughputBench, Torch, WireBench,
-    read_observations,
-};
+use crate::bench::{self, SimulatorsBench, ThroughputBench, WireBench};
 use crate::build_info;
-use crate::files::{self, policy_folder};
+use crate::command::policy::{LoadedPolicy, PolicyArguments};
+use crate::files;
 
 /// Benchmark decisions, episodes, the wire and simulators on this machine
 #[derive(Debug, Args)]
@@ -28,39 +26,10 @@ pub struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Part {
-    Decision(DecisionArguments),
+    Decision(decision::Arguments),
     Throughput(ThroughputArguments),
     Wire(WireArguments),
     Simulators(SimulatorsArguments),
-}
-
-/// Measure one decision at a time on recorded observations: prefill, decode, parse, score, choose
-#[derive(Debug, Args)]
-struct DecisionArguments {
-    /// Folder of the checkpoint [default: the policy that comes with rever]
-    #[arg(long)]
-    policy: Option<PathBuf>,
-    /// Device that the policy runs on: cpu, cuda or cuda:N
-    #[arg(long, default_value_t)]
-    device: DeviceName,
-    /// File of the verifier [default: verifier.safetensors in the policy's folder]
-    #[arg(long)]
-    verifier: Option<PathBuf>,
-    /// File of recorded observations: images and instructions [default: eight built-in ones, of the included policy's image size]
-    #[arg(long, value_name = "FILE")]
-    observations: Option<PathBuf>,
-    /// Number of passes over all observations
-    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..))]
-    rounds: u32,
-    /// Also time the same decisions in PyTorch, alternating with rever
-    #[arg(long)]
-    compare: bool,
-    /// Python with PyTorch, for --compare
-    #[arg(long, value_name = "FILE", default_value = "python3")]
-    python: PathBuf,
-    /// Also write the figures to this file
-    #[arg(long, value_name = "FILE", value_parser = super::output_file)]
-    json: Option<PathBuf>,
 }
 
 /// Measure concurrent episodes: decisions and episodes per second, and the memory of this process
@@ -82,12 +51,11 @@ struct ThroughputArguments {
     /// Simulator of these servers
     #[arg(long, value_enum, default_value_t)]
     simulator: Simulator,
-    /// Folder of the checkpoint and its verifier [default: the policy that comes with rever]
-    #[arg(long)]
-    policy: Option<PathBuf>,
-    /// Device that the policy runs on: cpu, cuda or cuda:N
-    #[arg(long, default_value_t)]
-    device: DeviceName,
+    #[command(flatten)]
+    policy: PolicyArguments,
+    /// File of the verifier [default: verifier.safetensors in the policy's folder, if it exists]
+    #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
+    verifier: Option<PathBuf>,
     /// Python interpreter for the servers, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long, value_name = "FILE")]
     python: Option<PathBuf>,
@@ -141,7 +109,7 @@ struct StepsArguments {
 /// Runs the chosen benchmark and prints a table.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     match arguments.part {
-        Part::Decision(arguments) => decision(arguments, host),
+        Part::Decision(arguments) => decision::run(arguments, host),
         Part::Throughput(arguments) => throughput(arguments, host),
         Part::Wire(arguments) => wire(arguments, host),
         Part::Simulators(arguments) => simulators(arguments, host),
@@ -247,16 +215,14 @@ fn servers(
 }
 
 fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
-    let folder = policy_folder(arguments.policy.as_ref(), host)?;
-    let policy = Vla::load(&folder, arguments.device)?;
-    let file = folder.join(files::VERIFIER_FILE);
-    let verifier = Verifier::load(&file, policy.parser().digest())?;
+    let loaded = arguments.policy.load(host)?;
+    let verifier = verifier(arguments.verifier, &loaded)?;
     let count = usize::from(arguments.servers);
     let servers = servers(host, count, arguments.simulator, arguments.python)?;
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
     let bench = ThroughputBench {
-        policy: Arc::new(policy),
-        verifier: Arc::new(verifier),
+        policy: loaded.policy,
+        verifier,
         servers: &servers,
         sessions: &sessions,
         decisions: arguments.decisions,
@@ -280,7 +246,12 @@ fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
     };
     let head = ["sessions", "decisions", "decisions/s", "episodes/s", "MB before", "MB after"];
     print_table(&head, rows.iter().map(row));
-    println!("{} candidates, {} server processes", arguments.candidates, arguments.servers);
+    println!(
+        "{} candidates, strategy {}, {} server processes",
+        arguments.candidates,
+        bench.strategy(),
+        arguments.servers
+    );
     Ok(())
 }
 
@@ -297,88 +268,9 @@ fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
     std::fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
 }
 
-fn decision(arguments: DecisionArguments, host: &Host) -> Result<()> {
-    ensure!(
-        !arguments.compare || arguments.device == DeviceName::Cpu,
-        "--compare: expected --device cpu, because PyTorch runs on the CPU, got {}",
-        arguments.device
-    );
-    let folder = policy_folder(arguments.policy.as_ref(), host)?;
-    let file = arguments.verifier.unwrap_or_else(|| folder.join(files::VERIFIER_FILE));
-    let policy = Vla::load(&folder, arguments.device)?;
-    let verifier = Verifier::load(&file, policy.parser().digest())?;
-    let recorded = match arguments.observations {
-        Some(file) => file,
-        None => files::of_checkout(host, "agent/vla/tests/fixtures/bridge-small.safetensors")?,
-    };
-    let observations = read_observations(&recorded)?;
-    let torch = if arguments.compare {
-        let script = files::of_checkout(host, "agent/training/bench.py")?;
-        Some(Torch::start(&arguments.python, &script, &folder, &recorded)?)
-    } else {
-        None
-    };
-    let progress = ProgressBar::new(u64::from(arguments.rounds) + 1);
-    let style = "bench: {pos}/{len} rounds, {eta} left";
-    progress.set_style(ProgressStyle::with_template(style).context("progress line")?);
-    let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-    let bench = DecisionBench {
-        policy: Arc::new(policy),
-        verifier: Arc::new(verifier),
-        observations: &observations,
-        rounds: arguments.rounds as usize,
-        runtime: &runtime,
-    };
-    let report = bench.run(torch, |round| progress.set_position(round as u64))?;
-    progress.finish_and_clear();
-    if let Some(path) = &arguments.json {
-        write_json(path, serde_json::to_value(&report)?)?;
-    }
-    print(&report);
-    Ok(())
-}
-
-fn print(report: &Report) {
-    let row = |row: &bench::DecisionRow| {
-        vec![
-            row.setting.candidates.to_string(),
-            row.setting.temperature.to_string(),
-            format!("{:.2}", row.prefill_ms),
-            format!("{:.3}", row.step_ms),
-            format!("{:.1}", row.tokens),
-            format!("{:.1}", row.decision_ms_p50),
-            format!("{:.1}", row.decision_ms_p95),
-            format!("{:.0}", row.tokens_per_second),
-            format!("{:.0} %", 100.0 * row.bandwidth_share),
-        ]
-    };
-    let head =
-        ["N", "T", "prefill ms", "step ms", "tokens", "p50 ms", "p95 ms", "tokens/s", "bandwidth"];
-    print_table(&head, report.rows.iter().map(row));
-    let megabytes = report.rows.first().map_or(0.0, |row| row.weight_bytes as f64 / 1e6);
-    println!(
-        "{} decisions per row, {} threads. A token step reads {megabytes:.1} MB of weights;\n\
-         this machine reads a buffer of that size at {:.1} GB/s.",
-        report.decisions,
-        report.threads,
-        report.bandwidth_bytes_per_second / 1e9,
-    );
-    for one in &report.torch {
-        println!(
-            "PyTorch {:<10} {:>3} candidates: {:>8.1} ms (p50) {:>8.1} ms (p95)",
-            one.setting, one.candidates, one.decision_ms_p50, one.decision_ms_p95
-        );
-    }
-    for reason in report.torch_hello.iter().flat_map(|hello| &hello.broken) {
-        println!("PyTorch: {reason}");
-    }
-    println!(
-        "ratio_greedy {:.2} (time of five verified candidates / time of one greedy candidate)",
-        report.ratio_greedy
-    );
-    if let (Some(eager), Some(best)) = (report.ratio_eager, report.ratio_best) {
-        println!(
-            "ratio_eager {eager:.2}, ratio_best {best:.2} (time of PyTorch / time of rever, five candidates)"
-        );
-    }
+/// The named verifier, or the one in the policy's folder if there is one.
+fn verifier(named: Option<PathBuf>, policy: &LoadedPolicy) -> Result<Option<Arc<Verifier>>> {
+    let file = named.or_else(|| policy.verifier_file());
+    let load = |file: PathBuf| Verifier::load(&file, &policy.policy.info().digest).map(Arc::new);
+    file.map(load).transpose()
 }

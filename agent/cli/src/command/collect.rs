@@ -63,9 +63,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     )?;
     println!("labels: {}", episodes_arguments.labels.display());
     show(&outcome, arguments.json.as_deref(), output)?;
-    let policy = episodes_arguments.policy.as_ref();
-    let policy =
-        policy.map_or_else(String::new, |folder| format!(" --policy {}", folder.display()));
+    let policy = episodes_arguments.policy.source.words();
     println!("next: rever train {}{policy}", outcome.folder.display());
     Ok(())
 }

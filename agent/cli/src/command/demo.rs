@@ -12,6 +12,7 @@ use runtime::servers::Host;
 use store::plan::SeedRange;
 
 use super::episodes::{EpisodesArguments, Request};
+use super::policy::{PolicyArguments, verifier_beside};
 use super::{Output, report};
 
 /// Environment server processes: one per core of a small machine.
@@ -21,7 +22,8 @@ const SERVERS: u16 = 2;
 const CANDIDATES: u32 = 5;
 const TEMPERATURE: f32 = 1.0;
 
-/// Compare a single sample with the verifier's choice on all tasks, then build a page with videos
+/// Compare a single sample with the verifier's choice on all tasks, then build a page with videos; without a verifier,
+/// with the medoid of five
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Random initial layouts per task; each is run with a single sample and with the verifier
@@ -30,6 +32,8 @@ pub struct Arguments {
     /// Random seed of initial layouts and samples
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    #[command(flatten)]
+    policy: PolicyArguments,
     /// Folder of the run; rerun the same command to resume it [default: a folder under runs/]
     #[arg(long)]
     out: Option<PathBuf>,
@@ -44,13 +48,19 @@ pub struct Arguments {
 /// Runs the demonstration, then prints its results and the path of its page.
 pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let started = Instant::now();
+    let has_verifier = verifier_beside(&arguments.policy.source.folder(host)?).is_some();
+    let (compared, name) = match has_verifier {
+        true => (Strategy::Verifier, "the verifier"),
+        false => (Strategy::Medoid, "the medoid, because the policy has no verifier"),
+    };
     println!(
-        "{} random initial layouts per task, each run with a single sample and with the verifier (N = {CANDIDATES})",
+        "{} random initial layouts per task, each run with a single sample and with {name} (N = {CANDIDATES})",
         arguments.episodes
     );
     let setting = |strategy| Setting::new(strategy, CANDIDATES, TEMPERATURE);
     let episodes = EpisodesArguments {
         seed: arguments.seed,
+        policy: arguments.policy.clone(),
         servers: Some(SERVERS),
         fleet: "demo".to_owned(),
         out: arguments.out,
@@ -65,13 +75,14 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
             episodes: arguments.episodes,
             layouts: Layouts::Random,
             range: SeedRange::Evaluation,
-            settings: vec![setting(Strategy::Sample), setting(Strategy::Verifier)],
+            settings: vec![setting(Strategy::Sample), setting(compared)],
             is_default: false,
             output,
         },
     )?;
     let out = outcome.folder.join("report");
-    let page = report::build(&outcome.folder, &out, &outcome.policy, report::EPISODES_MAX)?;
+    let page =
+        report::build(&outcome.folder, &out, &arguments.policy.source, report::EPISODES_MAX, host)?;
     println!("\n{}", output.results(&outcome.results));
     println!("{}", report::describe(&page));
     println!("done in {:.0} s", started.elapsed().as_secs_f64());
@@ -79,8 +90,11 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
         ResultFile::new(&outcome.results, outcome.provenance.clone())?.write(path)?;
     }
     outcome.ending.ensure_complete(&outcome.folder)?;
-    println!(
-        "next: open the page, or evaluate your own checkpoint: rever evaluate --policy FOLDER"
-    );
+    match arguments.policy.source.words().as_str() {
+        "" => println!(
+            "next: open the page, or evaluate your own checkpoint: rever evaluate --policy FOLDER"
+        ),
+        policy => println!("next: open the page, or: rever evaluate{policy}"),
+    }
     Ok(())
 }

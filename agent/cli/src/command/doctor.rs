@@ -3,12 +3,14 @@
 //! It changes nothing on the machine. For a missing part it prints the command that installs it.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, ensure};
 use clap::Args;
-use decision::{ActionSpace, Image, Policy, ProposalRequest};
+use decision::{ActionSpace, Image, Policy, PolicyInfo, ProposalRequest};
 use protocol::{Open, PROTOCOL_VERSION, Reset};
+use runtime::rollout::first_malformed;
 use runtime::servers::{
     Deployment, Host, Installation, LocalSource, Missing, PythonEnvironment, ServerProgram,
     ServerSource, Simulator,
@@ -16,10 +18,11 @@ use runtime::servers::{
 use runtime::wire::{Environment, ServerDescription};
 use serde::Serialize;
 use store::plan::SeedRange;
+use tokio::runtime::Runtime;
 use verifier::Verifier;
-use vla::{DeviceName, Vla};
 
 use super::names::{FLEET_DEFAULT, endpoint, fleet, short};
+use super::policy::{LoadedPolicy, PolicyArguments};
 use crate::files;
 
 /// The image size if no policy could be loaded.
@@ -28,11 +31,10 @@ const IMAGE_SIZE_DEFAULT: (usize, usize) = (128, 128);
 /// Check what a run needs and change nothing: Python, rendering, policy, verifier, servers
 #[derive(Debug, Clone, Args)]
 pub struct Arguments {
-    /// Folder of the checkpoint [default: the policy that comes with rever]
-    #[arg(long, value_name = "FOLDER")]
-    policy: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
     /// File of the verifier [default: verifier.safetensors in the policy's folder]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
     verifier: Option<PathBuf>,
     /// Start a server of this simulator
     #[arg(long, value_enum, default_value_t, conflicts_with = "connect")]
@@ -64,7 +66,8 @@ struct Finding {
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let mut findings = Vec::new();
     let installation = files::installation_unchanged(host)?;
-    let folder = arguments.policy.unwrap_or_else(|| installation.policy_folder());
+    let named = arguments.policy.source.policy.clone();
+    let folder = named.unwrap_or_else(|| installation.policy_folder());
     let source = ServerSource {
         local: arguments.connect.is_empty().then_some(LocalSource {
             count: 1,
@@ -84,7 +87,8 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             program = check(&mut findings, "simulator", || check_simulator(local));
         }
     }
-    let policy = check(&mut findings, "policy", || check_policy(&folder, &installation));
+    let policy =
+        check(&mut findings, "policy", || check_policy(&arguments.policy, &folder, &installation));
     if let Some(policy) = &policy {
         let beside = folder.join(files::VERIFIER_FILE);
         let named = arguments.verifier.as_deref();
@@ -92,15 +96,19 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             println!("none  verifier    train one with `rever collect` and `rever train`");
         } else {
             let path = named.unwrap_or(&beside);
-            check(&mut findings, "verifier", || check_verifier(path, &installation, policy));
+            check(&mut findings, "verifier", || {
+                check_verifier(path, &installation, policy.as_ref())
+            });
         }
     }
     if program.is_some() || source.local.is_none() {
         let size = policy.as_ref().map_or(IMAGE_SIZE_DEFAULT, |policy| policy.info().image_size);
-        let image =
-            check(&mut findings, "environment", || check_environment(&source, program, size));
+        let runtime = Runtime::new().context("cannot start the async runtime")?;
+        let check_environment = || check_environment(&runtime, &source, program, size);
+        let image = check(&mut findings, "environment", check_environment);
         if let (Some(policy), Some((image, instruction))) = (&policy, image) {
-            check(&mut findings, "decision", || check_decision(policy, &image, &instruction));
+            let decide = || check_decision(&runtime, policy.as_ref(), &image, &instruction);
+            check(&mut findings, "decision", decide);
         }
     }
     if let Some(path) = &arguments.json {
@@ -110,7 +118,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let failed: Vec<&str> =
         findings.iter().filter(|finding| !finding.is_ok).map(|finding| finding.name).collect();
     ensure!(failed.is_empty(), "not ready: {}", failed.join(", "));
-    println!("ready: try `rever demo`");
+    println!("ready: try `rever demo{}`", arguments.policy.source.words());
     Ok(())
 }
 
@@ -157,22 +165,33 @@ fn check_simulator(local: &LocalSource) -> Result<(ServerProgram, String)> {
     Ok((program, text))
 }
 
-fn check_policy(folder: &Path, installation: &Installation) -> Result<(Vla, String)> {
+fn check_policy(
+    arguments: &PolicyArguments,
+    folder: &Path,
+    installation: &Installation,
+) -> Result<(Arc<dyn Policy>, String)> {
     let begun = Instant::now();
-    let policy = Vla::load(folder, DeviceName::Cpu)?;
-    let (height, width) = policy.info().image_size;
+    let LoadedPolicy { policy, checkpoint, .. } = arguments.load_folder(folder.to_owned())?;
+    let PolicyInfo { digest, image_size: (height, width), hidden_size, .. } = policy.info();
+    let hidden = hidden_size.map_or("none".to_owned(), |size| size.to_string());
+    let mut description = checkpoint.iter().flat_map(|one| one.parser().description());
+    let thought = description.find(|(name, _)| *name == "chain of thought");
+    let thought = thought.map_or_else(|| "unknown".to_owned(), |(_, value)| value);
     let text = format!(
-        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden size {}",
+        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden size {hidden}, chain of thought: {thought}",
         place(folder, installation),
         begun.elapsed().as_millis(),
-        short(policy.parser().digest()),
-        policy.parser().hidden_size()
+        short(digest),
     );
     Ok((policy, text))
 }
 
-fn check_verifier(path: &Path, installation: &Installation, policy: &Vla) -> Result<((), String)> {
-    let verifier = Verifier::load(path, policy.parser().digest())?;
+fn check_verifier(
+    path: &Path,
+    installation: &Installation,
+    policy: &dyn Policy,
+) -> Result<((), String)> {
+    let verifier = Verifier::load(path, &policy.info().digest)?;
     let place = place(path, installation);
     Ok(((), format!("{place}: digest {}, matches the policy", short(verifier.digest()))))
 }
@@ -187,14 +206,14 @@ fn place(path: &Path, installation: &Installation) -> String {
 
 /// Opens the network, finds a server, resets an environment and steps it once.
 fn check_environment(
+    runtime: &Runtime,
     source: &ServerSource,
     program: Option<ServerProgram>,
     image_size: (usize, usize),
 ) -> Result<((Image, String), String)> {
-    let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
-    let deployment = source.open_with(program, &runtime, 1)?;
+    let deployment = source.open_with(program, runtime, 1)?;
     let result = runtime.block_on(try_environment(&deployment, image_size));
-    deployment.close(&runtime)?;
+    deployment.close(runtime)?;
     result
 }
 
@@ -244,7 +263,12 @@ fn described(server: &ServerDescription, servers: usize) -> String {
     )
 }
 
-fn check_decision(policy: &Vla, image: &Image, instruction: &str) -> Result<((), String)> {
+fn check_decision(
+    runtime: &Runtime,
+    policy: &dyn Policy,
+    image: &Image,
+    instruction: &str,
+) -> Result<((), String)> {
     let request = ProposalRequest {
         image,
         state: &[],
@@ -254,12 +278,24 @@ fn check_decision(policy: &Vla, image: &Image, instruction: &str) -> Result<((),
         seed: 0,
     };
     let begun = Instant::now();
-    let proposals = policy.propose_now(&[request])?;
+    let proposals = runtime.block_on(policy.propose(&[request]))?;
     let milliseconds = begun.elapsed().as_millis();
     let candidates =
         &proposals.first().ok_or_else(|| anyhow!("the policy returned no proposal"))?.candidates;
     let well_formed = candidates.iter().filter(|candidate| candidate.parsed.is_ok()).count();
     let count = candidates.len();
-    ensure!(well_formed > 0, "none of {count} candidates is well formed: is this policy trained?");
-    Ok(((), format!("{well_formed} of {count} candidates well formed, in {milliseconds} ms")))
+    let read =
+        "is the checkpoint read as it was trained (--reasoning, --prompt, --max-new-tokens)?";
+    ensure!(
+        well_formed > 0,
+        "none of {count} candidates is well formed; {}; {read}",
+        candidates.first().map_or_else(String::new, |first| first_malformed(first, policy))
+    );
+    let parsed = candidates.iter().filter_map(|candidate| candidate.parsed.as_ref().ok());
+    let partly = parsed.filter(|parsed| !parsed.reasoning.unread.is_empty()).count();
+    let partly = if partly > 0 { format!(", {partly} partly read") } else { String::new() };
+    Ok((
+        (),
+        format!("{well_formed} of {count} candidates well formed{partly}, in {milliseconds} ms"),
+    ))
 }

@@ -18,10 +18,10 @@ use store::plan::{OfferedTask, SeedRange};
 use store::run::{self, Run, RunRequest};
 use tokio::runtime::Runtime;
 use verifier::Verifier;
-use vla::DeviceName;
 
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
-use super::{Output, WrongUsage, policy, selection};
+use super::policy::{LoadedPolicy, PolicyArguments, verifier_beside};
+use super::{Output, WrongUsage, selection};
 use crate::files::VERIFIER_FILE;
 use crate::{build_info, files};
 
@@ -29,6 +29,8 @@ use crate::{build_info, files};
 const SERVERS_DEFAULT: u16 = 2;
 /// Default number of concurrent episodes. Batches of this size amortize reading the weights from memory.
 const SESSIONS_DEFAULT: u16 = 16;
+/// The field of a run's header for options of the checkpoint.
+pub const POLICY_OPTIONS: &str = "policy_options";
 /// The default label store.
 const LABELS_DEFAULT: &str = "runs/labels.sqlite";
 
@@ -43,12 +45,8 @@ pub struct EpisodesArguments {
     /// Random seed of initial layouts and samples
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
-    /// Folder of the checkpoint [default: the policy that comes with rever]
-    #[arg(long, value_name = "FOLDER", help_heading = "Policy and verifier")]
-    pub policy: Option<PathBuf>,
-    /// Device that the policy runs on: cpu, cuda or cuda:N
-    #[arg(long, default_value_t, help_heading = "Policy and verifier")]
-    pub device: DeviceName,
+    #[command(flatten)]
+    pub policy: PolicyArguments,
     /// File of the verifier [default: verifier.safetensors in the policy's folder, if it exists]
     #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
     pub verifier: Option<PathBuf>,
@@ -112,8 +110,6 @@ pub struct Request {
 pub struct Outcome {
     /// The run's folder.
     pub folder: PathBuf,
-    /// The folder of the checkpoint.
-    pub policy: PathBuf,
     /// Rates and gains over all recorded episodes.
     pub results: Results,
     /// What determines the results: options, versions, build.
@@ -128,8 +124,7 @@ impl Default for EpisodesArguments {
         EpisodesArguments {
             tasks: Vec::new(),
             seed: 0,
-            policy: None,
-            device: DeviceName::Cpu,
+            policy: PolicyArguments::default(),
             verifier: None,
             follow_verifier: None,
             servers: None,
@@ -150,11 +145,16 @@ impl Default for EpisodesArguments {
 impl EpisodesArguments {
     /// Runs the episodes that are not recorded yet, then computes the results of all recorded ones.
     pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
-        let folder = files::policy_folder(self.policy.as_ref(), host)?;
-        let policy = policy::load(&folder, self.device)?;
-        let digest = policy.parser().digest().to_owned();
-        let verifier = self.verifier(&folder, &digest)?;
-        let settings = self.settings(&request, &folder, verifier.as_deref())?;
+        let folder = self.policy.source.folder(host)?;
+        let file = self.verifier_file(&folder);
+        // Before the weights are loaded, which takes minutes for a large checkpoint.
+        let settings = self.settings(&request, &folder, file.is_some())?;
+        let wrong_usage = |error: anyhow::Error| WrongUsage(format!("{error:#}"));
+        file.as_deref().map(Verifier::load_any).transpose().map_err(wrong_usage)?;
+        let LoadedPolicy { policy, .. } = self.policy.load_folder(folder.clone())?;
+        let digest = policy.info().digest.clone();
+        let verifier = file.map(|file| Verifier::load(&file, &digest).map(Arc::new)).transpose();
+        let verifier = verifier.map_err(wrong_usage)?;
         // Opened now, so that a label store that cannot be used fails before any episode runs.
         LabelStore::open(&self.labels).map(drop)?;
         let runtime = Runtime::new().context("cannot start the async runtime")?;
@@ -189,7 +189,7 @@ impl EpisodesArguments {
             title: request.title.to_owned(),
             plans,
             settings,
-            policy: Arc::new(policy),
+            policy,
             scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
             follow_verifier: self.follow_verifier.clone().map(|name| (name, load_scorer(digest))),
             sessions: usize::from(self.sessions),
@@ -202,17 +202,16 @@ impl EpisodesArguments {
             None => self.open_servers(&runtime, host),
         })?;
         let (results, provenance) = results(&run_folder)?;
-        Ok(Outcome { folder: run_folder, policy: folder, results, provenance, ending })
+        Ok(Outcome { folder: run_folder, results, provenance, ending })
     }
 
-    /// The verifier of `--verifier`, or else the one beside the policy's weights unless a published one is followed.
-    fn verifier(&self, policy: &Path, digest: &str) -> Result<Option<Arc<Verifier>>> {
-        let beside = policy.join(VERIFIER_FILE);
-        let is_beside = self.follow_verifier.is_none() && beside.is_file();
-        let path = self.verifier.clone().or_else(|| is_beside.then_some(beside));
-        let load = |path: PathBuf| Verifier::load(&path, digest).map(Arc::new);
-        let verifier = path.map(load).transpose();
-        verifier.map_err(|error| WrongUsage(format!("{error:#}")).into())
+    /// The file of `--verifier`, or else the one beside the policy's weights unless a published one is followed.
+    fn verifier_file(&self, policy: &Path) -> Option<PathBuf> {
+        let beside = || match self.follow_verifier {
+            None => verifier_beside(policy),
+            Some(_) => None,
+        };
+        self.verifier.clone().or_else(beside)
     }
 
     /// The settings to run. Without a verifier, a setting that needs one is wrong usage, or skipped if it is a default.
@@ -220,13 +219,11 @@ impl EpisodesArguments {
         &self,
         request: &Request,
         policy: &Path,
-        verifier: Option<&Verifier>,
+        has_verifier: bool,
     ) -> Result<Vec<Setting>> {
         let settings = &request.settings;
         let is_possible = |setting: &Setting| {
-            !setting.strategy.needs_verifier()
-                || verifier.is_some()
-                || self.follow_verifier.is_some()
+            !setting.strategy.needs_verifier() || has_verifier || self.follow_verifier.is_some()
         };
         let Some(setting) = settings.iter().find(|setting| !is_possible(setting)) else {
             return Ok(settings.clone());
@@ -266,7 +263,7 @@ impl EpisodesArguments {
 
     /// Everything that determines the results, by name. Servers and concurrency do not.
     fn options(&self, tasks: Vec<String>, request: &Request, settings: &[Setting]) -> Value {
-        json!({
+        let mut options = json!({
             "tasks": tasks,
             "episodes": request.episodes,
             "layouts": request.layouts,
@@ -275,10 +272,15 @@ impl EpisodesArguments {
             "settings": settings.iter().map(Setting::to_string).collect::<Vec<_>>(),
             "follow_verifier": self.follow_verifier,
             // Devices add in a different order, which rarely changes which token is drawn.
-            "device": self.device.to_string(),
+            "device": self.policy.device.to_string(),
             "all_hidden": self.all_hidden,
             "video": self.video,
-        })
+        });
+        // The policy's digest covers them; a run without them has the header that it always had.
+        if let Some(given) = self.policy.source.checkpoint.header() {
+            options[POLICY_OPTIONS] = given;
+        }
+        options
     }
 
     /// The folder of `--out`, or one named after a digest of everything that determines the results.

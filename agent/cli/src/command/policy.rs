@@ -1,21 +1,213 @@
-//! Loads the policy of `--policy`. A folder that cannot be used is wrong usage; the message says what to do.
+//! The policy of `--policy`: its arguments, and how it is loaded. What cannot be used is wrong usage; the message says
+//! what to do.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::Result;
-use vla::{DeviceName, Vla};
+use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use decision::Policy;
+use runtime::servers::Host;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use vla::{CompletionParser, DeviceName, LoadOptions, ReasoningMode, Vla};
 
 use super::WrongUsage;
+use crate::files::{self, VERIFIER_FILE};
 
-/// Loads a checkpoint onto a device.
-pub fn load(folder: &Path, device: DeviceName) -> Result<Vla> {
-    let name = folder.display();
-    if !folder.is_dir() {
-        return Err(WrongUsage(format!(
-            "--policy: expected a checkpoint's folder, but {name} is not a folder; download a checkpoint from the \
-             Hugging Face Hub with `hf download OWNER/NAME --local-dir FOLDER`"
-        ))
-        .into());
+/// Which policy, and what it runs on.
+#[derive(Debug, Clone, Default, Args)]
+#[command(next_help_heading = "Policy and verifier")]
+pub struct PolicyArguments {
+    #[command(flatten)]
+    pub source: PolicySource,
+    /// Device that the policy runs on: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    pub device: DeviceName,
+}
+
+/// Which policy, and how its files are read.
+#[derive(Debug, Clone, Default, Args)]
+#[command(next_help_heading = "Policy and verifier")]
+pub struct PolicySource {
+    /// Folder of the checkpoint [default: the policy that comes with rever]
+    #[arg(long, value_name = "FOLDER")]
+    pub policy: Option<PathBuf>,
+    #[command(flatten)]
+    pub checkpoint: CheckpointArguments,
+}
+
+/// What a checkpoint's files may leave open.
+#[derive(Debug, Clone, Default, Args)]
+#[command(next_help_heading = "Policy and verifier")]
+pub struct CheckpointArguments {
+    /// Dataset whose statistics scale the actions, such as bridge_orig; needed if the checkpoint has several
+    #[arg(long, value_name = "DATASET")]
+    pub unnorm_key: Option<String>,
+    /// Whether the checkpoint writes a chain of thought before its action, as ECoT does
+    #[arg(long, default_value_t, value_name = "MODE",
+          value_parser = PossibleValuesParser::new(ReasoningMode::ALL.map(ReasoningMode::name))
+              .try_map(|mode| mode.parse::<ReasoningMode>()))]
+    pub reasoning: ReasoningMode,
+    /// Prompt of the policy, with {instruction} once [default: that of the checkpoint's family]
+    #[arg(long, value_name = "TEXT")]
+    pub prompt: Option<String>,
+    /// Maximum tokens of a completion [default: the checkpoint's limit]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub max_new_tokens: Option<u32>,
+    /// Crop images to the central 90 % of their area, for checkpoints that were fine-tuned with random crops (LIBERO)
+    #[arg(long)]
+    pub center_crop: bool,
+}
+
+/// A policy that is ready to decide.
+pub struct LoadedPolicy {
+    /// Proposes candidates.
+    pub policy: Arc<dyn Policy>,
+    /// The same policy, if it is a local checkpoint.
+    pub checkpoint: Option<Arc<Vla>>,
+    /// The checkpoint's folder, which may hold a verifier.
+    pub folder: Option<PathBuf>,
+    /// The name to show: a folder or an address.
+    pub name: String,
+}
+
+impl PolicyArguments {
+    /// Loads the policy, or the one that comes with the program.
+    pub fn load(&self, host: &Host) -> Result<LoadedPolicy> {
+        self.load_folder(self.source.folder(host)?)
     }
-    Vla::load(folder, device).map_err(|error| WrongUsage(format!("{error:#}")).into())
+
+    /// Loads the checkpoint in a folder that [`PolicySource`] has chosen.
+    pub fn load_folder(&self, folder: PathBuf) -> Result<LoadedPolicy> {
+        ensure_folder(&folder)?;
+        let options = self.source.checkpoint.options();
+        let policy = Vla::load(&folder, self.device, &options).map_err(wrong_usage)?;
+        let policy = Arc::new(policy);
+        Ok(LoadedPolicy {
+            policy: Arc::clone(&policy) as Arc<dyn Policy>,
+            checkpoint: Some(policy),
+            name: folder.display().to_string(),
+            folder: Some(folder),
+        })
+    }
+}
+
+impl PolicySource {
+    /// The folder of the checkpoint, or of the one that comes with the program.
+    pub fn folder(&self, host: &Host) -> Result<PathBuf> {
+        let folder = files::policy_folder(self.policy.as_ref(), host)?;
+        ensure_folder(&folder)?;
+        Ok(folder)
+    }
+
+    /// Loads what reads the records of a run with these policy options in its header, made with a policy of this
+    /// digest. Options of the command line take precedence. Needs no weights.
+    pub fn parser_of_run(
+        &self,
+        recorded: Option<&Value>,
+        digest: &str,
+        host: &Host,
+    ) -> Result<CompletionParser> {
+        let folder = self.folder(host)?;
+        let options = match (self.checkpoint.header(), recorded) {
+            (None, Some(recorded)) => LoadOptions::deserialize(recorded)?,
+            _ => self.checkpoint.options(),
+        };
+        CompletionParser::load_for_records(&folder, &options, digest).map_err(wrong_usage)
+    }
+
+    /// Loads what reads the checkpoint's completions, without the network.
+    pub fn parser(&self, host: &Host) -> Result<CompletionParser> {
+        let folder = self.folder(host)?;
+        CompletionParser::load(&folder, &self.checkpoint.options()).map_err(wrong_usage)
+    }
+
+    /// The arguments of this policy for a further command, with a space before them; empty for the policy that comes
+    /// with the program.
+    pub fn words(&self) -> String {
+        let folder = self.policy.as_ref().map(|folder| folder.display().to_string());
+        let policy = folder.map_or_else(String::new, |folder| format!(" --policy {folder}"));
+        policy + &self.checkpoint.words()
+    }
+}
+
+impl CheckpointArguments {
+    /// The options as the checkpoint's loader takes them.
+    pub fn options(&self) -> LoadOptions {
+        LoadOptions {
+            unnorm_key: self.unnorm_key.clone(),
+            reasoning: self.reasoning,
+            prompt: self.prompt.clone(),
+            max_new_tokens: self.max_new_tokens.map(|tokens| tokens as usize),
+            center_crop: self.center_crop,
+        }
+    }
+
+    /// The options that were given, for the header of a run; `None` without any.
+    pub fn header(&self) -> Option<Value> {
+        let options = self.options();
+        (options != LoadOptions::default()).then(|| json!(options))
+    }
+
+    /// The options as they are typed, with a space before each.
+    pub fn words(&self) -> String {
+        let mut words = String::new();
+        let mut add = |name: &str, value: Option<String>| {
+            if let Some(value) = value {
+                words += &format!(" --{name} {value}");
+            }
+        };
+        add("unnorm-key", self.unnorm_key.clone());
+        let reasoning = (self.reasoning != ReasoningMode::Auto).then(|| self.reasoning.to_string());
+        add("reasoning", reasoning);
+        add("prompt", self.prompt.as_ref().map(|prompt| quoted(prompt)));
+        add("max-new-tokens", self.max_new_tokens.map(|tokens| tokens.to_string()));
+        if self.center_crop {
+            words += " --center-crop";
+        }
+        words
+    }
+}
+
+impl LoadedPolicy {
+    /// The verifier in the policy's folder, if there is one.
+    pub fn verifier_file(&self) -> Option<PathBuf> {
+        self.folder.as_deref().and_then(verifier_beside)
+    }
+}
+
+/// The verifier beside a checkpoint's weights, if there is one.
+pub fn verifier_beside(folder: &Path) -> Option<PathBuf> {
+    let file = folder.join(VERIFIER_FILE);
+    file.is_file().then_some(file)
+}
+
+fn ensure_folder(folder: &Path) -> Result<()> {
+    if folder.is_dir() {
+        return Ok(());
+    }
+    let name = folder.to_string_lossy();
+    let download = match name.split('/').collect::<Vec<_>>().as_slice() {
+        // A name on the Hub.
+        [owner, name] if !owner.is_empty() && !owner.starts_with('.') => {
+            format!("`hf download {owner}/{name} --local-dir {name}`, then --policy {name}")
+        }
+        _ => "`hf download OWNER/NAME --local-dir FOLDER`".to_owned(),
+    };
+    Err(WrongUsage(format!(
+        "--policy: expected a checkpoint's folder, but {name} is not a folder; download a checkpoint from the \
+         Hugging Face Hub with {download}"
+    ))
+    .into())
+}
+
+fn wrong_usage(error: anyhow::Error) -> anyhow::Error {
+    WrongUsage(format!("{error:#}")).into()
+}
+
+/// A word for a POSIX shell.
+fn quoted(text: &str) -> String {
+    format!("'{}'", text.replace('\'', r"'\''"))
 }

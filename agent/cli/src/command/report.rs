@@ -9,15 +9,21 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::files::{installation, policy_folder};
+use super::episodes::POLICY_OPTIONS;
+use super::policy::PolicySource;
+use crate::files::installation;
 use evaluation::report::{self, Readers, Report, ReportOptions, Speech};
 use runtime::servers::{Host, LocalSource, Simulator};
+use store::record::EpisodeRecord;
 use store::run;
 use terms::ScoreTerms;
 use vla::CompletionParser;
 
 /// Default number of episodes whose steps are written: about 100 MB.
 pub const EPISODES_MAX: usize = 1000;
+
+/// Episodes whose candidates are compared with what the policy reads.
+const EPISODES_CHECKED: usize = 3;
 
 /// Servers that render videos: one per core of a small machine.
 const SERVERS: usize = 2;
@@ -30,10 +36,9 @@ pub struct Arguments {
     /// The report's folder [default: `report` in the run's folder]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
-    /// Folder of the policy that the run was made with; its tokenizer turns tokens into text
-    /// [default: the policy that comes with rever]
-    #[arg(long, value_name = "FOLDER")]
-    policy: Option<PathBuf>,
+    /// The policy that the run was made with; its tokenizer turns tokens into text
+    #[command(flatten)]
+    policy: PolicySource,
     /// Verifier that scored the run, to show the terms of its scores
     /// [default: verifier.safetensors in the policy's folder]
     #[arg(long, value_name = "FILE")]
@@ -59,7 +64,6 @@ pub struct Arguments {
 /// Builds the report and says where it is.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let out = arguments.out.unwrap_or_else(|| arguments.run.join("report"));
-    let policy = policy_folder(arguments.policy.as_ref(), host)?;
     if arguments.video {
         let local = LocalSource {
             count: SERVERS,
@@ -72,7 +76,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     }
     let options =
         ReportOptions { run: &arguments.run, out: &out, episodes_max: arguments.episodes_max };
-    let report = build_with(&options, &policy, arguments.verifier.as_deref())?;
+    let report = build_with(&options, &arguments.policy, arguments.verifier.as_deref(), host)?;
     if let Some(path) = &arguments.json {
         let text = serde_json::to_string_pretty(&report)?;
         std::fs::write(path, text + "\n")
@@ -83,28 +87,32 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
 }
 
 /// Builds the report of a run with the policy that made it, and the verifier in the policy's folder.
-pub fn build(run: &Path, out: &Path, policy: &Path, episodes_max: usize) -> Result<Report> {
-    build_with(&ReportOptions { run, out, episodes_max }, policy, None)
+pub fn build(
+    run: &Path,
+    out: &Path,
+    policy: &PolicySource,
+    episodes_max: usize,
+    host: &Host,
+) -> Result<Report> {
+    build_with(&ReportOptions { run, out, episodes_max }, policy, None, host)
 }
 
 fn build_with(
     options: &ReportOptions<'_>,
-    policy: &Path,
+    policy: &PolicySource,
     verifier: Option<&Path>,
+    host: &Host,
 ) -> Result<Report> {
     let header = run::read_header(options.run)?;
-    let parser = CompletionParser::load(policy)?;
-    let (expected, found) = (header.versions["policy"].as_str(), parser.digest());
-    ensure!(
-        expected == Some(found),
-        "policy: the run was made with {}, got {found}; only its tokenizer can decode the tokens of the run (--policy)",
-        expected.unwrap_or("an unknown one")
-    );
+    let digest = header.versions["policy"].as_str();
+    let digest = digest.context("run.json: expected the digest of a policy, got none")?;
+    let parser = policy.parser_of_run(header.options.get(POLICY_OPTIONS), digest, host)?;
+    ensure_parser_of(options.run, &parser)?;
     let speak = |tokens: &[u32]| Speech {
         text: parser.text(tokens),
         reasoning: parser.parse(tokens).ok().map(|parsed| parsed.reasoning),
     };
-    let terms = ScoreTerms::load(verifier, policy, &parser)?;
+    let terms = ScoreTerms::load(verifier, &policy.folder(host)?, &parser)?;
     let explain = |record: &_| terms.of(record);
     let readers = Readers { speak: &speak, terms: terms.names(), explain: &explain };
     let bar = ProgressBar::no_length().with_prefix("report");
@@ -116,6 +124,26 @@ fn build_with(
     let report = report::build(options, &readers, &progress);
     bar.finish_and_clear();
     report
+}
+
+/// Whether the parser reads the candidates of a run as they were read when they were executed. The weights of the policy
+/// are not needed: a report takes a second even for a checkpoint of 15 GB.
+fn ensure_parser_of(run: &Path, parser: &CompletionParser) -> Result<()> {
+    for id in run::recorded(run)?.iter().take(EPISODES_CHECKED) {
+        let record = EpisodeRecord::read(&run::record_path(run, id))?;
+        let candidates = record.decisions().flat_map(|decision| &decision.candidates);
+        for candidate in candidates.filter(|candidate| !candidate.tokens.is_empty()) {
+            let Some(recorded) = &candidate.actions else { continue };
+            let read = parser.parse(&candidate.tokens);
+            ensure!(
+                read.as_ref().is_ok_and(|parsed| parsed.actions == *recorded),
+                "policy: the run was made with {}, and this policy reads its candidates in another way (episode {id}); \
+                 only the tokenizer and the options of the run's policy can decode its tokens (--policy)",
+                parser.digest()
+            );
+        }
+    }
+    Ok(())
 }
 
 fn bar_style() -> ProgressStyle {

@@ -9,6 +9,7 @@ use store::run;
 use verifier::Verifier;
 use vla::CompletionParser;
 
+use super::policy::CheckpointArguments;
 use super::{Output, WrongUsage, episodes, train};
 
 /// Show the results of a run, the metrics of a verifier or the sizes of a policy
@@ -20,6 +21,8 @@ use super::{Output, WrongUsage, episodes, train};
 pub struct Arguments {
     /// Folder of a run, file of a verifier or folder of a checkpoint
     path: PathBuf,
+    #[command(flatten)]
+    checkpoint: CheckpointArguments,
 }
 
 /// Prints the description.
@@ -30,7 +33,7 @@ pub fn run(arguments: &Arguments, output: Output) -> Result<()> {
         println!("next: rever evaluate --strategies sample,verifier --verifier {}", path.display());
         Ok(())
     } else if path.join("config.json").is_file() {
-        show_policy(path)
+        show_policy(path, &arguments.checkpoint)
     } else {
         run::read_header(path).map_err(|error| {
             WrongUsage(format!(
@@ -61,13 +64,13 @@ fn show_run(path: &Path, output: Output) -> Result<()> {
     Ok(())
 }
 
-fn show_policy(folder: &Path) -> Result<()> {
-    let parser = CompletionParser::load(folder)?;
+fn show_policy(folder: &Path, options: &CheckpointArguments) -> Result<()> {
+    let parser = CompletionParser::load(folder, &options.options())?;
     println!("policy {}: digest {}", folder.display(), parser.digest());
     for (name, value) in parser.description() {
         println!("  {name:<22} {value}");
     }
-    println!("next: rever evaluate --policy {}", folder.display());
+    println!("next: rever evaluate --policy {}{}", folder.display(), options.words());
     Ok(())
 }
 

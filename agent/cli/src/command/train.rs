@@ -20,7 +20,7 @@ use vla::CompletionParser;
 
 use super::WrongUsage;
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet, short};
-use crate::files::policy_folder;
+use super::policy::PolicySource;
 
 /// How long to wait for an agent that follows the verifier. After that it is published anyway.
 const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
@@ -37,9 +37,9 @@ pub struct Arguments {
     /// Label store to train on; episodes that cannot be used are skipped and counted
     #[arg(long, default_value = "runs/labels.sqlite", conflicts_with = "runs")]
     labels: PathBuf,
-    /// Folder of the policy that collected the episodes [default: the policy that comes with rever]
-    #[arg(long, value_name = "FOLDER")]
-    policy: Option<PathBuf>,
+    /// The policy that collected the episodes
+    #[command(flatten)]
+    policy: PolicySource,
     /// File to write the verifier to
     #[arg(long, default_value = "verifier.safetensors", value_parser = super::output_file)]
     out: PathBuf,
@@ -111,7 +111,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     for folder in &arguments.runs {
         store::run::read_header(folder).map_err(|error| WrongUsage(format!("{error:#}")))?;
     }
-    let parser = CompletionParser::load(&policy_folder(arguments.policy.as_ref(), host)?)?;
+    let parser = arguments.policy.parser(host)?;
     let action_space = parser.action_space();
     let (episodes, excluded) = read(&arguments, &parser, &action_space)?;
     ensure!(

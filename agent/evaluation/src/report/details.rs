@@ -51,6 +51,9 @@ enum Candidate {
         /// Name, left, top, right, bottom.
         boxes: Vec<(usize, u16, u16, u16, u16)>,
         gripper: Vec<[u16; 2]>,
+        /// The sections that were only partly read, with reasons.
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        unread: Vec<usize>,
     },
     Malformed {
         score: Option<f64>,
@@ -187,6 +190,7 @@ fn candidate(
         says: says.map(|phrase| phrases.number(phrase)),
         boxes,
         gripper: reasoning.gripper_position,
+        unread: record.unread.iter().map(|reason| phrases.number(reason.clone())).collect(),
     })
 }
 

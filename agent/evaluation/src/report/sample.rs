@@ -39,6 +39,7 @@ pub fn speak(tokens: &[u32]) -> Speech {
         move_reasoning: "the gripper must go to above the spoon".into(),
         movement: format!("move {}", ["forward", "left down", "<script>"][first as usize % 3]),
         gripper_position: vec![[128, first]],
+        unread: Vec::new(),
     };
     Speech { text, reasoning: (first % 17 != 0).then_some(reasoning) }
 }
@@ -190,6 +191,7 @@ fn candidate(level: f32, random: &mut ChaCha8Rng) -> CandidateRecord {
     CandidateRecord {
         actions: is_well_formed.then(|| ActionChunk::single(action).expect("finite numbers")),
         malformed: (!is_well_formed).then(|| "expected 7 action tokens, got </s>".to_owned()),
+        unread: Vec::new(),
         score: is_well_formed.then(|| (level + random.random_range(-0.2..0.2)).clamp(0.0, 1.0)),
         log_probability: -12.5,
         log_probabilities: Vec::new(),

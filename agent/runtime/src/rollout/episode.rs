@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use decision::{Candidate, Decision, EpisodeContext, Observation, PolicyInfo, Scorer, probability};
+use decision::{Candidate, Decision, EpisodeContext, Observation, Policy, Scorer, probability};
 use protocol::{Reset, TaskDescription};
 use store::queue::Lease;
 use store::record::{
@@ -14,6 +14,7 @@ use store::record::{
 
 use super::RecordOptions;
 use super::batcher::{Answer, DecisionBatcher};
+use super::first_decisions::FirstDecisions;
 use crate::fault::AttemptFault;
 use crate::session::{Environment, Episode, Session, SessionInfo, SessionPool};
 use crate::sinks::{Event, Sinks};
@@ -23,7 +24,8 @@ pub struct EpisodeRun<'a, P> {
     pub lease: &'a Lease,
     pub options: RecordOptions,
     pub versions: &'a Versions,
-    pub policy: &'a PolicyInfo,
+    pub policy: &'a dyn Policy,
+    pub first_decisions: &'a FirstDecisions,
     /// The scorer of the whole episode, even if a new verifier is published meanwhile.
     pub scorer: Option<Arc<dyn Scorer>>,
     pub batcher: &'a DecisionBatcher,
@@ -113,6 +115,7 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
         let Answer { context, decision, batch_time, batch_size } =
             answer.ok_or(AttemptFault::Stopped)?;
         let Decision { candidates, logits, chosen, actions } = decision?;
+        self.first_decisions.note(&candidates, self.policy)?;
         let records = candidates.into_iter().enumerate().map(|(index, candidate)| {
             let keep_hidden = self.options.all_hidden || chosen == Some(index);
             candidate_record(candidate, logits.as_ref().map(|logits| logits[index]), keep_hidden)
@@ -161,7 +164,7 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
             identity: self.lease.job.identity.clone(),
             versions: Versions {
                 simulator: info.simulator.clone(),
-                policy: self.policy.digest.clone(),
+                policy: self.policy.info().digest.clone(),
                 verifier: self.scorer.as_ref().map(|scorer| scorer.digest().to_owned()),
                 ..self.versions.clone()
             },
@@ -192,13 +195,17 @@ fn candidate_record(
     keep_hidden: bool,
 ) -> CandidateRecord {
     let is_well_formed = candidate.parsed.is_ok();
-    let (actions, malformed) = match candidate.parsed {
-        Ok(parsed) => (Some(parsed.actions), None),
-        Err(malformed) => (None, Some(malformed.to_string())),
+    let (actions, unread, malformed) = match candidate.parsed {
+        Ok(parsed) => {
+            let unread = parsed.reasoning.unread.iter().map(ToString::to_string).collect();
+            (Some(parsed.actions), unread, None)
+        }
+        Err(malformed) => (None, Vec::new(), Some(malformed.to_string())),
     };
     CandidateRecord {
         actions,
         malformed,
+        unread,
         // A malformed candidate has no action, so it has no success probability.
         score: logit.filter(|_| is_well_formed).map(probability),
         log_probability: candidate.log_probability,

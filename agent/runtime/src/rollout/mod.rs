@@ -14,6 +14,7 @@
 
 mod batcher;
 mod episode;
+mod first_decisions;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -32,6 +33,8 @@ use crate::sinks::{Event, Sinks};
 use crate::stop::{Stop, asked};
 use batcher::DecisionBatcher;
 use episode::EpisodeRun;
+use first_decisions::FirstDecisions;
+pub use first_decisions::{NeverWellFormed, first_malformed};
 
 /// Optional content of records.
 #[derive(Debug, Clone, Copy, Default)]
@@ -75,6 +78,7 @@ impl<P: SessionPool> Rollout<P> {
         let shared = Arc::new(Shared {
             rollout: self,
             batcher,
+            first_decisions: FirstDecisions::new(),
             active,
             leased: AtomicUsize::new(0),
             returned: Notify::new(),
@@ -105,6 +109,7 @@ impl<P: SessionPool> Rollout<P> {
 struct Shared<P> {
     rollout: Rollout<P>,
     batcher: DecisionBatcher,
+    first_decisions: FirstDecisions,
     /// Number of episodes between reset and end.
     active: Arc<AtomicUsize>,
     /// Number of leases held by workers.
@@ -165,6 +170,10 @@ impl<P: SessionPool> Shared<P> {
                 pool.release(Session { info, environment });
                 queue.complete(lease).await
             }
+            Err(AttemptFault::NeverWellFormed(fault)) => {
+                self.note_fault(lease, &info, fault.clone().into()).await?;
+                Err(fault.into())
+            }
             Err(fault) => self.note_fault(lease, &info, fault).await,
         }
     }
@@ -178,7 +187,8 @@ impl<P: SessionPool> Shared<P> {
             lease,
             options: self.rollout.options,
             versions: &self.rollout.versions,
-            policy: self.rollout.decider.policy().info(),
+            policy: self.rollout.decider.policy().as_ref(),
+            first_decisions: &self.first_decisions,
             scorer: self.rollout.scorer.borrow().clone(),
             batcher: &self.batcher,
             sinks: &self.rollout.sinks,

@@ -148,6 +148,7 @@ mod tests {
             tokens: vec![first_token; 7],
             actions: (first_token > 0).then(|| ActionChunk::single(action).expect("finite")),
             malformed: (first_token == 0).then(|| "expected an action, got none".to_owned()),
+            unread: Vec::new(),
             score: None,
             log_probability: -1.0,
             log_probabilities: vec![-0.5; 7],

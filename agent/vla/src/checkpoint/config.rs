@@ -1,22 +1,20 @@
-//! A checkpoint's `config.json` with OpenVLA's fields. Unknown layouts are refused.
+//! A checkpoint's configuration: `config.json` with OpenVLA's fields, and what was chosen of it.
+//! Unknown layouts are refused.
 
-use std::collections::BTreeMap;
-use std::path::Path;
+mod family;
+mod file;
+mod prompt;
+mod statistics;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 
 use crate::network::rotary::HeadShape;
 
+pub use statistics::ActionScale;
+
 /// Dimensions of an action: three of translation, three of rotation, the gripper.
 pub const ACTION_LENGTH: usize = 7;
-/// Maximum tokens of a completion if the checkpoint states no limit; this is ECoT's own limit.
-const REASONING_TOKENS_MAX: usize = 1024;
-
-const OPENVLA_PROMPT: &str = "In: What action should the robot take to {instruction}?\nOut:";
-const VICUNA_PROMPT: &str = "A chat between a curious user and an artificial intelligence \
-    assistant. The assistant gives helpful, detailed, and polite answers to the user's questions. \
-    USER: What action should the robot take to {instruction}? ASSISTANT: TASK:";
 
 /// The architecture, inputs and outputs of the network; its JSON is part of the checkpoint's
 /// identity.
@@ -34,6 +32,17 @@ pub struct Config {
     /// Whether completions contain a chain of thought before the action.
     pub reasoning: bool,
     pub completion_tokens_max: usize,
+    // The identities of checkpoints without the following are older than these fields.
+    /// Whether a chain of thought is read as far as possible, instead of refused with its action.
+    #[serde(skip_serializing_if = "is_false")]
+    pub partial_reasoning: bool,
+    /// Whether images are cropped to the central 90 % of their area and enlarged again.
+    #[serde(skip_serializing_if = "is_false")]
+    pub center_crop: bool,
+}
+
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 /// One vision transformer, with timm's field names.
@@ -96,164 +105,6 @@ impl Default for TextConfig {
     }
 }
 
-/// The scale from normalised to physical actions: 1st and 99th percentile of the training data.
-#[derive(Debug, Clone, Deserialize, Serialize)]
-pub struct ActionScale {
-    pub q01: [f64; ACTION_LENGTH],
-    pub q99: [f64; ACTION_LENGTH],
-    /// False for a dimension that is not normalised.
-    pub mask: [bool; ACTION_LENGTH],
-}
-
-/// The fields of the file that determine the layout. Fields that matter only for training are
-/// ignored.
-#[derive(Deserialize)]
-struct File {
-    model_type: String,
-    #[serde(default)]
-    llm_backbone_id: String,
-    timm_model_ids: Vec<String>,
-    #[serde(default)]
-    timm_override_act_layers: Vec<Option<String>>,
-    use_fused_vision_backbone: bool,
-    image_sizes: Vec<usize>,
-    image_resize_strategy: String,
-    vision_config: Option<TowerConfig>,
-    fused_vision_config: Option<TowerConfig>,
-    text_config: TextConfig,
-    pad_to_multiple_of: usize,
-    n_action_bins: usize,
-    norm_stats: BTreeMap<String, DatasetStatistics>,
-    unnorm_key: Option<String>,
-    prompt_template: Option<String>,
-    #[serde(default)]
-    reasoning: bool,
-    max_new_tokens: Option<usize>,
-}
-
-#[derive(Deserialize)]
-struct DatasetStatistics {
-    action: ActionScale,
-}
-
-impl Config {
-    /// Loads and checks `config.json`.
-    pub fn load(path: &Path) -> Result<Config> {
-        let name = path.display();
-        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {name}"))?;
-        Config::parse(&text).with_context(|| format!("cannot use {name}"))
-    }
-
-    fn parse(text: &str) -> Result<Config> {
-        let file: File = serde_json::from_str(text)?;
-        ensure!(
-            file.model_type == "openvla",
-            "model_type: expected openvla, got {}",
-            file.model_type
-        );
-        ensure!(
-            file.timm_override_act_layers.iter().all(Option::is_none),
-            "timm_override_act_layers: expected null for every tower, got {:?}",
-            file.timm_override_act_layers
-        );
-        ensure!(
-            ["resize-naive", "letterbox"].contains(&file.image_resize_strategy.as_str()),
-            "image_resize_strategy: expected resize-naive or letterbox, got {}",
-            file.image_resize_strategy
-        );
-        let towers = file.towers()?;
-        let image_size = towers[0].image_size;
-        ensure!(
-            file.image_sizes.iter().all(|&size| size == image_size)
-                && towers.iter().all(|tower| tower.image_size == image_size),
-            "image_sizes: expected {image_size} for every tower, got {:?}",
-            file.image_sizes
-        );
-        file.text_config.check()?;
-        let vocabulary = file.text_config.vocab_size.saturating_sub(file.pad_to_multiple_of);
-        ensure!(
-            file.n_action_bins == 256 && vocabulary > 256,
-            "n_action_bins: expected 256 and a vocabulary of more than 256 tokens, got {} and {vocabulary}",
-            file.n_action_bins
-        );
-        let limit = if file.reasoning { REASONING_TOKENS_MAX } else { ACTION_LENGTH + 1 };
-        Ok(Config {
-            image_size,
-            towers,
-            vocabulary,
-            action_bins: file.n_action_bins,
-            action_scale: file.action_scale()?,
-            prompt_template: file.prompt_template()?,
-            reasoning: file.reasoning,
-            completion_tokens_max: file.max_new_tokens.unwrap_or(limit),
-            text: TextConfig {
-                num_key_value_heads: Some(file.text_config.key_value_heads()),
-                ..file.text_config
-            },
-        })
-    }
-}
-
-impl File {
-    fn towers(&self) -> Result<Vec<TowerConfig>> {
-        let count = if self.use_fused_vision_backbone { 2 } else { 1 };
-        ensure!(
-            self.timm_model_ids.len() == count,
-            "timm_model_ids: expected {count} towers, got {:?}",
-            self.timm_model_ids
-        );
-        let described = [&self.vision_config, &self.fused_vision_config];
-        let towers = self.timm_model_ids.iter().zip(described).map(|(id, described)| {
-            let known = TowerConfig::of_timm(id);
-            match (known, described) {
-                (Some(known), None) => Ok(known),
-                (None, Some(described)) => Ok(described.clone()),
-                (Some(_), Some(_)) => {
-                    bail!("vision_config: expected none, because {id} is a known tower")
-                }
-                (None, None) => bail!("timm_model_ids: expected a known tower or one described in vision_config, got {id}"),
-            }
-        });
-        let towers: Vec<TowerConfig> = towers.collect::<Result<_>>()?;
-        for tower in &towers {
-            tower.check()?;
-        }
-        Ok(towers)
-    }
-
-    fn action_scale(&self) -> Result<ActionScale> {
-        let datasets: Vec<&String> = self.norm_stats.keys().collect();
-        let key = match (&self.unnorm_key, datasets.as_slice()) {
-            (Some(key), _) => key,
-            (None, [only]) => *only,
-            (None, _) => bail!("unnorm_key: expected one of {datasets:?} in config.json, got none"),
-        };
-        let statistics = self.norm_stats.get(key);
-        let statistics = statistics
-            .with_context(|| format!("unnorm_key: expected one of {datasets:?}, got {key:?}"))?;
-        let scale = statistics.action.clone();
-        let finite = scale.q01.iter().chain(&scale.q99).all(|number| number.is_finite());
-        ensure!(finite, "norm_stats of {key}: expected finite q01 and q99, got {scale:?}");
-        Ok(scale)
-    }
-
-    fn prompt_template(&self) -> Result<String> {
-        let template = match (&self.prompt_template, self.llm_backbone_id.as_str()) {
-            (Some(template), _) => template.as_str(),
-            (None, "llama2-7b-pure") => OPENVLA_PROMPT,
-            (None, "vicuna-v15-7b") => VICUNA_PROMPT,
-            (None, other) => {
-                bail!("prompt_template: expected one, because llm_backbone_id {other:?} is unknown")
-            }
-        };
-        ensure!(
-            template.matches("{instruction}").count() == 1,
-            "prompt_template: expected {{instruction}} once, got {template:?}"
-        );
-        Ok(template.to_string())
-    }
-}
-
 impl TowerConfig {
     /// The vision towers of OpenVLA-7B by their timm names.
     fn of_timm(id: &str) -> Option<TowerConfig> {
@@ -302,6 +153,12 @@ impl TowerConfig {
         );
         ensure!(self.depth >= 2, "depth: expected at least 2 blocks, got {}", self.depth);
         Ok(())
+    }
+
+    /// Whether this is a DINOv2 tower with registers, whose images are normalised with ImageNet's
+    /// values.
+    pub fn is_dino(&self) -> bool {
+        self.class_token && self.registers > 0 && self.layer_scale
     }
 
     /// Patches along one side.

@@ -6,6 +6,7 @@ pub mod confidence;
 pub mod config;
 pub mod digest_cache;
 pub mod identity;
+pub mod options;
 pub mod parse;
 pub mod prompt;
 pub mod shards;

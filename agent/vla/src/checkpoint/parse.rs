@@ -3,8 +3,13 @@
 use decision::{ActionChunk, Malformed, Parsed, Reasoning};
 
 use super::actions::ActionBins;
-use super::config::ACTION_LENGTH;
+use super::config::{ACTION_LENGTH, Config};
 use super::prompt::{LLAMA_SPACE, Prompter};
+
+/// Whether these are the tokens of one action and nothing else.
+pub fn is_action(tokens: &[u32], bins: &ActionBins) -> bool {
+    tokens.len() == ACTION_LENGTH && tokens.iter().all(|&id| bins.contains(id))
+}
 
 /// Whether only `</s>` can follow, or the completion cannot become well-formed any more.
 pub fn is_complete(tokens: &[u32], bins: &ActionBins) -> bool {
@@ -18,7 +23,7 @@ pub fn is_complete(tokens: &[u32], bins: &ActionBins) -> bool {
 /// Parses a completion without its `</s>`.
 pub fn parse(
     tokens: &[u32],
-    reasoning: bool,
+    config: &Config,
     bins: &ActionBins,
     prompter: &Prompter,
 ) -> Result<Parsed, Malformed> {
@@ -30,7 +35,9 @@ pub fn parse(
         thought => thought,
     };
     let text = prompter.text(thought);
-    let reasoning = if reasoning {
+    let reasoning = if config.partial_reasoning {
+        Reasoning::read(&text)
+    } else if config.reasoning {
         Reasoning::parse(&text)?
     } else if thought.is_empty() {
         Reasoning::default()

@@ -111,9 +111,15 @@ impl<'a> Weights<'a> {
     }
 }
 
+/// Positions that older versions of transformers save with every layer; they are computed here.
+const DEAD_SUFFIX: &str = ".rotary_emb.inv_freq";
+
 /// Whether a tensor affects no output; `towers` are the vision towers' names with their numbers of
 /// used blocks.
 pub fn is_dead(name: &str, towers: &[(&str, usize)]) -> bool {
+    if name.ends_with(DEAD_SUFFIX) {
+        return true;
+    }
     towers.iter().any(|(tower, blocks_used)| {
         let Some(rest) = name.strip_prefix(tower).and_then(|rest| rest.strip_prefix('.')) else {
             return false;

@@ -9,7 +9,7 @@ use candle_core::Tensor;
 use rayon::prelude::*;
 
 use crate::checkpoint::actions::ActionBins;
-use crate::checkpoint::parse::is_complete;
+use crate::checkpoint::parse::{is_action, is_complete};
 use crate::generate::sampling::{Draw, Stream, draw};
 use crate::kernels::segment::GROWTH;
 use crate::network::forward::{Context, Network};
@@ -30,6 +30,9 @@ pub struct Limits<'a> {
     /// Ids from here on are padding of the embedding and are never sampled.
     pub vocabulary: usize,
     pub end: u32,
+    /// Whether a completion is complete after an action without `</s>`: policies without a chain
+    /// of thought may be trained without it, and their reference does not wait for it.
+    pub action_ends: bool,
 }
 
 /// A completion that is finished or in progress.
@@ -136,6 +139,11 @@ impl Completion {
     fn draw(&mut self, logits: &[f32], limits: &Limits<'_>) -> Result<Option<u32>> {
         let Draw { token, log_probability } =
             draw(logits, self.temperature, self.stream.uniform())?;
+        if limits.action_ends && token != limits.end && is_action(&self.tokens, limits.bins) {
+            // The token is not part of the candidate. This step was computed for the hidden state
+            // of the last action token.
+            return Ok(None);
+        }
         self.log_probability += log_probability;
         if token == limits.end {
             return Ok(None);
@@ -144,5 +152,57 @@ impl Completion {
         self.log_probabilities.push(log_probability as f32);
         let done = self.tokens.len() > self.tokens_max || is_complete(&self.tokens, limits.bins);
         Ok(if done { None } else { Some(token) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::checkpoint::config::ActionScale;
+
+    const END: u32 = 2;
+
+    /// The tokens of a greedy completion if the network wants `ids`, and their log-probability.
+    fn completed(ids: &[u32], action_ends: bool) -> (Vec<u32>, f64) {
+        let scale = ActionScale { q01: [0.0; 7], q99: [1.0; 7], mask: [true; 7] };
+        let bins = ActionBins::new(300, 256, scale);
+        let limits = Limits { bins: &bins, vocabulary: 300, end: END, action_ends };
+        let mut completion = Completion {
+            session: 0,
+            tokens: Vec::new(),
+            log_probability: 0.0,
+            log_probabilities: Vec::new(),
+            hidden: Vec::new(),
+            temperature: 0.0,
+            stream: Stream::new(0, 0),
+            tokens_max: 8,
+            row: Some(0),
+        };
+        for &id in ids {
+            let logits: Vec<f32> = (0..300).map(|one| if one == id { 1.0 } else { 0.0 }).collect();
+            if completion.draw(&logits, &limits).expect("logits").is_none() {
+                break;
+            }
+        }
+        (completion.tokens, completion.log_probability)
+    }
+
+    #[test]
+    fn an_action_without_an_end_token_is_complete_for_a_policy_without_reasoning() {
+        let action = [100, 101, 102, 103, 104, 105, 106];
+        let (ended, more) = ([&action[..], &[END]].concat(), [&action[..], &[107]].concat());
+        // Seven or eight tokens of equal likelihood.
+        let one = completed(&action[..1], true).1;
+        for action_ends in [true, false] {
+            let (tokens, sum) = completed(&ended, action_ends);
+            assert_eq!(tokens, action);
+            assert!((sum - 8.0 * one).abs() < 1e-9);
+        }
+        let (tokens, sum) = completed(&more, true);
+        assert_eq!(tokens, action, "the eighth token is not part of it");
+        assert!((sum - 7.0 * one).abs() < 1e-9);
+        assert_eq!(completed(&more, false).0, more, "a chain of thought must end");
+        let late = [&[5], &action[..]].concat();
+        assert_eq!(completed(&late, true).0, late, "an action comes first or is none");
     }
 }

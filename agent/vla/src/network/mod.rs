@@ -2,6 +2,7 @@
 
 pub mod attention;
 pub mod cache;
+pub mod center_crop;
 pub mod decoder;
 pub mod forward;
 pub mod linear;

@@ -8,7 +8,7 @@ pub struct Normalisation {
     pub deviation: [f32; 3],
 }
 
-/// ImageNet's values, for the DINO-like tower of a fused pair.
+/// ImageNet's values, for DINO-like towers.
 pub const DINO: Normalisation =
     Normalisation { mean: [0.485, 0.456, 0.406], deviation: [0.229, 0.224, 0.225] };
 

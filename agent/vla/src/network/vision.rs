@@ -62,9 +62,8 @@ impl VisionBackbone {
     pub fn load(mut weights: Part<'_, '_>, configs: &[TowerConfig]) -> Result<VisionBackbone> {
         let mut towers = Vec::new();
         for (index, config) in configs.iter().enumerate() {
-            let fused_first = configs.len() == 2 && index == 0;
-            let normalisation = if fused_first { DINO } else { SIGLIP };
             let name = TOWER_NAMES[index];
+            let normalisation = normalisation(configs, index);
             towers.push(Tower::load(weights.part(name), config, name, normalisation)?);
         }
         Ok(VisionBackbone { towers })
@@ -85,6 +84,12 @@ impl VisionBackbone {
             several => Ok(Tensor::cat(several, 1)?),
         }
     }
+}
+
+/// The first tower of a fused pair and a single DINOv2 tower have ImageNet's values.
+fn normalisation(configs: &[TowerConfig], index: usize) -> Normalisation {
+    let is_fused_first = configs.len() == 2 && index == 0;
+    if is_fused_first || configs[index].is_dino() { DINO } else { SIGLIP }
 }
 
 impl Tower {
@@ -215,4 +220,33 @@ fn onto(rows: &Tensor, linear: &Linear, input: &Tensor, scale: Option<&Tensor>) 
         Some(scale) => (rows + linear.forward(input)?.broadcast_mul(scale)?)?,
         None => linear.forward_onto(rows, input)?,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dinov2_tower_has_imagenets_values_alone_and_in_a_pair() {
+        let siglip = TowerConfig {
+            image_size: 224,
+            patch_size: 14,
+            embed_dim: 1152,
+            depth: 27,
+            num_heads: 16,
+            mlp_ratio: 4.0,
+            class_token: false,
+            registers: 0,
+            layer_scale: false,
+        };
+        let dino =
+            TowerConfig { class_token: true, registers: 4, layer_scale: true, ..siglip.clone() };
+        let means = |configs: &[TowerConfig]| -> Vec<f32> {
+            (0..configs.len()).map(|index| normalisation(configs, index).mean[0]).collect()
+        };
+        assert_eq!(means(std::slice::from_ref(&dino)), [0.485]);
+        assert_eq!(means(std::slice::from_ref(&siglip)), [0.5]);
+        assert_eq!(means(&[dino, siglip.clone()]), [0.485, 0.5]);
+        assert_eq!(means(&[siglip.clone(), siglip]), [0.485, 0.5]);
+    }
 }

@@ -9,7 +9,7 @@ use super::*;
 use crate::checkpoint::config::Config;
 
 /// Loads a copy of a tiny checkpoint with changed weights and configuration.
-fn load_changed(
+pub fn load_changed(
     name: &str,
     weights: impl FnOnce(&mut HashMap<String, Tensor>) -> Result<()>,
     config: impl FnOnce(&mut serde_json::Value),
@@ -24,10 +24,15 @@ fn load_changed(
     config(&mut value);
     std::fs::write(directory.path().join("config.json"), value.to_string())?;
     std::fs::copy(source.join("tokenizer.json"), directory.path().join("tokenizer.json"))?;
-    Vla::load(directory.path(), DeviceName::Cpu)
+    Vla::load(directory.path(), DeviceName::Cpu, &LoadOptions::default())
 }
 
-fn refusal(policy: Result<Vla>) -> String {
+/// Loads a tiny checkpoint as it is, with options.
+pub fn load_with(name: &str, options: &LoadOptions) -> Result<Vla> {
+    Vla::load_on(&fixtures().join(name), &Device::Cpu, Backend::Kernels, options)
+}
+
+pub fn refusal(policy: Result<Vla>) -> String {
     match policy {
         // The outermost context contains a temporary path.
         Err(error) => error.chain().skip(1).map(ToString::to_string).collect::<Vec<_>>().join(": "),
@@ -35,7 +40,7 @@ fn refusal(policy: Result<Vla>) -> String {
     }
 }
 
-fn identity(policy: Result<Vla>) -> Result<String> {
+pub fn identity(policy: Result<Vla>) -> Result<String> {
     Ok(policy?.parser().digest().to_owned())
 }
 
@@ -100,7 +105,7 @@ fn the_identity_does_not_depend_on_how_files_are_written() -> Result<()> {
     }
     let index = serde_json::json!({ "weight_map": weight_map });
     std::fs::write(directory.path().join("model.safetensors.index.json"), index.to_string())?;
-    let sharded = identity(Vla::load(directory.path(), DeviceName::Cpu))?;
+    let sharded = identity(Vla::load(directory.path(), DeviceName::Cpu, &LoadOptions::default()))?;
     assert_eq!(sharded, expected, "shards, indentation");
     Ok(())
 }
@@ -208,7 +213,7 @@ fn unknown_layouts_are_refused_with_a_reason() {
     );
     check(
         |c| c["unnorm_key"] = "bridge_orig".into(),
-        "unnorm_key: expected one of [\"rever_bridge\"], got \"bridge_orig\"",
+        "unnorm_key: expected one of [\"rever_bridge\"] (norm_stats of config.json), got \"bridge_orig\"",
     );
     check(
         |c| c["prompt_template"] = serde_json::Value::Null,
@@ -235,7 +240,7 @@ fn openvla_7b_is_a_known_layout() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let path = directory.path().join("config.json");
     std::fs::write(&path, text)?;
-    let config = Config::load(&path)?;
+    let config = Config::load(directory.path(), &LoadOptions::default())?;
     assert_eq!(config.vocabulary, 32000);
     assert_eq!(config.towers.iter().map(|tower| tower.embed_dim).sum::<usize>(), 2176);
     assert_eq!(config.towers.iter().map(|tower| tower.depth - 2).collect::<Vec<_>>(), [22, 25]);

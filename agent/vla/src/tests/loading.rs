@@ -16,7 +16,7 @@ use crate::network::forward::Network;
 
 /// Loads the network alone, with a digest, and returns what was reported and left.
 fn load_network(directory: &Path) -> Result<(Vec<Loaded>, Rest)> {
-    let config = Config::load(&directory.join("config.json"))?;
+    let config = Config::load(directory, &LoadOptions::default())?;
     let shards = Shards::open(directory)?;
     let hashing = Fingerprint::of(directory, &config)?.start(&shards, &config)?;
     let used = used_tensors(&shards, &config);
@@ -35,7 +35,7 @@ fn every_tensor_is_read_once_and_reported() -> Result<()> {
     // norm.
     for (name, dead_weights) in [("tiny", 0), ("tiny-fused", 14 + 12 + 2 * 2)] {
         let (reports, rest) = load_network(&fixtures().join(name))?;
-        let digest = CompletionParser::load(&fixtures().join(name))?.digest().to_owned();
+        let digest = CompletionParser::load(&fixtures().join(name), &LoadOptions::default())?.digest().to_owned();
         assert_eq!(rest, Rest { dead_weights, digest: Some(digest), bytes_read_again: 0 });
         assert!(reports.is_sorted_by(|one, next| one.bytes < next.bytes), "{name}: {reports:?}");
         let last = reports.last().expect("a report");
@@ -50,7 +50,7 @@ fn a_file_that_was_cut_is_refused() -> Result<()> {
     let weights = directory.path().join("model.safetensors");
     let length = std::fs::metadata(&weights)?.len();
     std::fs::OpenOptions::new().write(true).open(&weights)?.set_len(length - 1)?;
-    let error = Vla::load(directory.path(), DeviceName::Cpu).err().expect("a refusal");
+    let error = Vla::load(directory.path(), DeviceName::Cpu, &LoadOptions::default()).err().expect("a refusal");
     let expected = format!("safetensors file: expected {length} bytes, got {}", length - 1);
     assert!(format!("{error:#}").ends_with(&expected), "{error:#}");
     Ok(())
@@ -70,7 +70,7 @@ fn a_kept_digest_counts_only_while_nothing_has_changed() -> Result<()> {
     let directory = copy()?;
     let folder = directory.path();
     let elsewhere = folder.join("elsewhere");
-    let config = Config::load(&folder.join("config.json"))?;
+    let config = Config::load(folder, &LoadOptions::default())?;
     let fingerprint = Fingerprint::of(folder, &config)?;
     let other =
         Fingerprint::of(folder, &Config { prompt_template: "{instruction}".into(), ..config })?;
@@ -110,7 +110,7 @@ fn a_digest_is_kept_elsewhere_where_the_folder_cannot_be_written() -> Result<()>
     let elsewhere = folder.join("elsewhere");
     // Also root cannot write a file in place of a folder.
     std::fs::create_dir_all(folder.join(".rever-digest.json/occupied"))?;
-    let config = Config::load(&folder.join("config.json"))?;
+    let config = Config::load(folder, &LoadOptions::default())?;
     let fingerprint = Fingerprint::of(folder, &config)?;
     let cache = DigestCache::open(folder, Some(&elsewhere))?.of_any_size().settled_at_once();
     cache.keep(&fingerprint, "one");
@@ -123,7 +123,7 @@ fn a_digest_is_kept_elsewhere_where_the_folder_cannot_be_written() -> Result<()>
 /// The logits of the golden sequence, and the greedy tokens after its prompt.
 fn logits(name: &str, backend: Backend, format: WeightFormat) -> Result<(Tensor, Vec<u32>)> {
     let target = Target { device: Device::Cpu, backend, format };
-    let policy = Vla::load_on(&fixtures().join(name), target, &LoadOptions::default())?;
+    let policy = Vla::load_onto(&fixtures().join(name), &LoadOptions::default(), target, &Loading::default())?;
     let golden = Golden::load(&fixtures().join(name).join("activations.safetensors"))?;
     let (image, prompt) = (golden.image("image")?, golden.ids("prompt")?);
     let ids = [prompt.clone(), golden.ids("forced")?].concat();

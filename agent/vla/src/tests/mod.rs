@@ -1,7 +1,9 @@
 //! Tests of the whole policy: parity with PyTorch, shared prefixes, batches, seeds, refusals.
 
 mod checkpoint;
+mod families;
 mod loading;
+mod options;
 mod parity;
 mod proposal;
 
@@ -12,7 +14,7 @@ use candle_core::{DType, Device, Tensor};
 
 use decision::{Image, Policy as _};
 
-use super::{Backend, DeviceName, LoadOptions, Vla, WeightFormat};
+use super::{Backend, DeviceName, LoadOptions, Loading, Vla, WeightFormat};
 use crate::checkpoint::weights::Target;
 
 /// Both tiny layouts: one tower as in the shipped model, two as in OpenVLA-7B.
@@ -23,8 +25,7 @@ fn fixtures() -> PathBuf {
 }
 
 fn tiny(name: &str, backend: Backend) -> Result<Vla> {
-    let target = Target { device: Device::Cpu, backend, format: WeightFormat::Exact };
-    Vla::load_on(&fixtures().join(name), target, &LoadOptions::default())
+    Vla::load_on(&fixtures().join(name), &Device::Cpu, backend, &LoadOptions::default())
 }
 
 /// The golden tensors of one file by name.

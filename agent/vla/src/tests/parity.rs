@@ -82,7 +82,7 @@ fn steps_onto_a_shared_prefix_equal_the_whole_sequence() -> Result<()> {
 #[test]
 fn the_shipped_model_equals_pytorch_on_recorded_observations() -> Result<()> {
     let model = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/bridge-small");
-    let policy = Vla::load(&model, DeviceName::Cpu)?;
+    let policy = Vla::load(&model, DeviceName::Cpu, &LoadOptions::default())?;
     let golden = Golden::load(&fixtures().join("bridge-small.safetensors"))?;
     for index in 0..8 {
         let name = |part: &str| format!("{index}.{part}");

@@ -203,7 +203,10 @@ fn log_probabilities_are_those_of_temperature_one() -> Result<()> {
 #[test]
 fn confidence_is_the_sum_over_each_section_and_each_action_dimension() -> Result<()> {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/bridge-small");
-    for policy in [Vla::load(&shipped, DeviceName::Cpu)?, tiny("tiny", Backend::Kernels)?] {
+    for policy in [
+        Vla::load(&shipped, DeviceName::Cpu, &LoadOptions::default())?,
+        tiny("tiny", Backend::Kernels)?,
+    ] {
         let image = image(6, policy.info().image_size.0);
         let proposal = policy.propose_now(&[request(&image, 8, 1.0, 4)])?.remove(0);
         for Candidate { tokens, log_probabilities, .. } in proposal.candidates {

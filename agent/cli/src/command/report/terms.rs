@@ -129,6 +129,7 @@ mod tests {
             tokens: Vec::new(),
             actions: Some(decision::ActionChunk::single(vec![0.0]).expect("an action")),
             malformed: None,
+            unread: Vec::new(),
             score: Some(probability(logit)),
             log_probability: 0.0,
             log_probabilities: Vec::new(),

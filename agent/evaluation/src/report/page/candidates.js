@@ -59,6 +59,7 @@ function card(step, index, view) {
   const move = view.phrases[candidate.says[MOVE]];
   const words = element("span", "move", move === "" ? "no reasoning" : move);
   does.append(words);
+  if (candidate.unread !== undefined) does.append(element("span", "tag", "partly read"));
   made.append(does);
   return made;
 }
@@ -103,6 +104,10 @@ function saidBy(step, view) {
     list.append(element("dt", "", TAGS[place]), said);
   });
   holder.append(list, ...candidate.actions.map(actionLine));
+  if (candidate.unread !== undefined) {
+    const reasons = candidate.unread.map((index) => view.phrases[index]).join("; ");
+    holder.append(element("p", "note", `Its reasoning was partly read: ${reasons}.`));
+  }
   return holder;
 }
 

@@ -45,6 +45,7 @@ fn record(episode: u32) -> EpisodeRecord {
         tokens: vec![1; 7],
         actions: is_well_formed.then(|| ActionChunk::single(vec![0.0; 7]).expect("finite")),
         malformed: (!is_well_formed).then(|| "expected an action, got none".to_owned()),
+        unread: Vec::new(),
         score: None,
         log_probability: -1.0,
         log_probabilities: vec![-0.5; 7],
