@@ -39,8 +39,9 @@ mod command_line;
 // Evaluations with the shipped models: results, killed processes, faults, the report.
 mod whole_loop;
 
-// Policies other than the included one.
+// Policies other than the included one: checkpoints and policy servers.
 mod any_policy;
+mod policy_servers;
 
 // The page of a run in a browser.
 mod report_page;

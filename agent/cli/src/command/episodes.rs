@@ -1,9 +1,11 @@
 //! Running episodes: the arguments and the steps that `demo`, `evaluate` and `collect` share.
 
+mod ready;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use clap::Args;
 use decision::{Scorer, Setting, TaskId};
 use evaluation::results::{Results, tasks_in_order};
@@ -20,10 +22,10 @@ use tokio::runtime::Runtime;
 use verifier::Verifier;
 
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
-use super::policy::{LoadedPolicy, PolicyArguments, verifier_beside};
-use super::{Output, WrongUsage, policy_server, selection};
-use crate::files::VERIFIER_FILE;
+use super::policy::PolicyArguments;
+use super::{Output, WrongUsage, selection};
 use crate::{build_info, files};
+use ready::Ready;
 
 /// Default number of server processes on this machine.
 const SERVERS_DEFAULT: u16 = 2;
@@ -147,30 +149,8 @@ impl Default for EpisodesArguments {
 impl EpisodesArguments {
     /// Runs the episodes that are not recorded yet, then computes the results of all recorded ones.
     pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
-        let server = self.policy.connect(host)?;
-        let folder = match server {
-            Some(_) => None,
-            None => Some(self.policy.source.folder(host)?),
-        };
-        let file = self.verifier_file(folder.as_deref());
-        // Before the weights are loaded, which takes minutes for a large checkpoint.
-        let settings = match server.as_ref().and_then(|loaded| loaded.server.as_deref()) {
-            Some(server) => policy_server::possible(server, &request.settings, request.is_default)?,
-            None => request.settings.clone(),
-        };
-        let settings =
-            self.settings(settings, request.is_default, folder.as_deref(), file.is_some())?;
-        let wrong_usage = |error: anyhow::Error| WrongUsage(format!("{error:#}"));
-        file.as_deref().map(Verifier::load_any).transpose().map_err(wrong_usage)?;
-        let LoadedPolicy { policy, server, .. } = match (server, folder) {
-            (Some(loaded), _) => loaded,
-            (None, Some(folder)) => self.policy.load_folder(folder)?,
-            (None, None) => bail!("expected a folder or a policy server"),
-        };
-        let server = server.as_deref().map(policy_server::header).transpose()?;
+        let Ready { policy, settings, verifier, server } = self.ready(&request, host)?;
         let digest = policy.info().digest.clone();
-        let verifier = file.map(|file| Verifier::load(&file, &digest).map(Arc::new)).transpose();
-        let verifier = verifier.map_err(wrong_usage)?;
         // Opened now, so that a label store that cannot be used fails before any episode runs.
         LabelStore::open(&self.labels).map(drop)?;
         let runtime = Runtime::new().context("cannot start the async runtime")?;
@@ -220,46 +200,6 @@ impl EpisodesArguments {
         })?;
         let (results, provenance) = results(&run_folder)?;
         Ok(Outcome { folder: run_folder, results, provenance, ending })
-    }
-
-    /// The file of `--verifier`, or else the one beside the policy's weights unless a published one is followed.
-    fn verifier_file(&self, policy: Option<&Path>) -> Option<PathBuf> {
-        let beside = || match self.follow_verifier {
-            None => policy.and_then(verifier_beside),
-            Some(_) => None,
-        };
-        self.verifier.clone().or_else(beside)
-    }
-
-    /// The settings to run. Without a verifier, a setting that needs one is wrong usage, or skipped if it is a default.
-    fn settings(
-        &self,
-        settings: Vec<Setting>,
-        is_default: bool,
-        policy: Option<&Path>,
-        has_verifier: bool,
-    ) -> Result<Vec<Setting>> {
-        let is_possible = |setting: &Setting| {
-            !setting.strategy.needs_verifier() || has_verifier || self.follow_verifier.is_some()
-        };
-        let Some(setting) = settings.iter().find(|setting| !is_possible(setting)) else {
-            return Ok(settings);
-        };
-        let remedy = match policy {
-            Some(policy) => format!(
-                "there is no {VERIFIER_FILE} in {}; train one with `rever collect --policy {0}` and `rever train --policy {0}`",
-                policy.display()
-            ),
-            None => "a policy server has no folder with one".to_owned(),
-        };
-        if !is_default {
-            let strategy = setting.strategy;
-            bail!(WrongUsage(format!(
-                "strategy {strategy}: expected a verifier (--verifier FILE), got none: {remedy}"
-            )));
-        }
-        eprintln!("skipping strategies that need a verifier: {remedy}");
-        Ok(settings.iter().copied().filter(is_possible).collect())
     }
 
     /// The full names of the tasks, if the run exists already. Servers are then started only if an episode is missing.

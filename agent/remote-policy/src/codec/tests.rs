@@ -2,7 +2,7 @@
 //! of a hostile peer.
 
 mod golden;
-mod hostile;
+pub mod hostile;
 mod refused;
 
 use super::{Array, KeyForm, Value};

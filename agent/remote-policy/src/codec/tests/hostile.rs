@@ -15,7 +15,7 @@ const FRAMES: usize = 100_000;
 const TIME_MAX: Duration = Duration::from_secs(120);
 
 /// A small generator of numbers: the frames are the same in every run.
-struct Random(u64);
+pub struct Random(pub u64);
 
 impl Random {
     /// SplitMix64 (Steele, Lea and Flood, 2014).
@@ -33,7 +33,7 @@ impl Random {
 }
 
 /// Changes, removes, inserts or repeats bytes in one to four places.
-fn mutate(frame: &[u8], other: &[u8], random: &mut Random) -> Vec<u8> {
+pub fn mutate(frame: &[u8], other: &[u8], random: &mut Random) -> Vec<u8> {
     /// Markers of lengths, nesting and extension types.
     const MARKERS: [u8; 10] = [0xc1, 0xc6, 0xc9, 0xd9, 0xdb, 0xdd, 0xdf, 0xc7, 0x9f, 0x8f];
     let mut bytes = frame.to_vec();

@@ -1,0 +1,169 @@
+//! Policy servers as policies: the served agent equals the local one, and servers made of the peers'
+//! own packages execute the same chunks.
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use store::record::{DecisionRecord, EpisodeRecord};
+
+use crate::evaluation::Evaluation;
+use crate::harness::{peers, repository, rever, run, text};
+
+const TASK: &str = "widowx_stack_cube";
+/// Actions of a chunk.
+const CHUNK: usize = 3;
+
+/// A running policy server; killed when dropped.
+struct Server {
+    child: Child,
+    /// Host and port.
+    place: String,
+}
+
+impl Server {
+    /// Starts a program that prints `ready` and where it listens.
+    fn start(mut command: Command) -> Server {
+        command.stdin(Stdio::null()).stdout(Stdio::piped());
+        let mut child = command.spawn().expect("the program starts");
+        let stdout = child.stdout.take().expect("its standard output is piped");
+        let mut line = String::new();
+        BufReader::new(stdout).read_line(&mut line).expect("its standard output is text");
+        let place = line.trim().strip_prefix("ready ");
+        let place = place.unwrap_or_else(|| panic!("expected \"ready PLACE\", got {line:?}"));
+        let place = place.trim_start_matches("ws://");
+        let place =
+            if place.contains(':') { place.to_owned() } else { format!("127.0.0.1:{place}") };
+        Server { child, place }
+    }
+
+    /// `rever serve-policy` of the included policy.
+    fn of_rever() -> Server {
+        let mut command = rever();
+        command.args(["serve-policy", "--listen", "127.0.0.1:0", "--strategy", "greedy"]);
+        Server::start(command)
+    }
+
+    /// A policy behind a peer's own server.
+    fn of_peer(wire: &str) -> Server {
+        let mut command = peers().command();
+        command.arg(repository().join("tests/policy_server.py")).args([wire, &CHUNK.to_string()]);
+        Server::start(command)
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        // It may have ended already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn evaluate(folder: &Path, name: &str, arguments: &[&str]) -> Vec<EpisodeRecord> {
+    let folder = folder.join(name);
+    std::fs::create_dir(&folder).expect("a folder");
+    let tasks = format!("--tasks={TASK}");
+    let arguments = [&[&*tasks, "--episodes=1", "--sessions=2"], arguments].concat();
+    let evaluation = Evaluation::new(&folder, &arguments);
+    evaluation.finish();
+    let records: Vec<EpisodeRecord> = evaluation.records().into_values().collect();
+    assert!(!records.is_empty());
+    records
+}
+
+/// A decision without its times.
+fn untimed(decision: &DecisionRecord) -> DecisionRecord {
+    DecisionRecord { batch_ms: 0.0, batch_size: 0, ..decision.clone() }
+}
+
+#[test]
+fn the_served_agent_decides_as_the_local_one_bit_by_bit() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let verifier = repository().join("agent/models/bridge-small/verifier.safetensors");
+    let verifier = format!("--verifier={}", verifier.display());
+    let settings =
+        ["--strategies=greedy,verifier", "--candidates=3", "--seed=5", "--all-hidden", &verifier];
+    let local = evaluate(folder.path(), "local", &settings);
+    let server = Server::of_rever();
+    for wire in ["openpi", "vla-eval"] {
+        let policy = format!("--policy={wire}://{}", server.place);
+        let served = evaluate(folder.path(), wire, &[&settings[..], &[&policy]].concat());
+        assert_eq!(served.len(), local.len());
+        for (served, local) in served.iter().zip(&local) {
+            assert_eq!(served.versions.policy, local.versions.policy, "the announced digest");
+            assert_eq!(served.steps.len(), local.steps.len(), "{}", local.identity.id());
+            for (step, (served, local)) in served.steps.iter().zip(&local.steps).enumerate() {
+                let (served, local) = (served.decision.as_ref(), local.decision.as_ref());
+                assert_eq!(served.map(untimed), local.map(untimed), "{wire}: step {step}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_chunk_is_the_same_whether_client_or_server_keeps_it() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let profile = folder.path().join("chunks.toml");
+    let shipped = repository().join("agent/remote-policy/profiles/simpler.toml");
+    let shipped = std::fs::read_to_string(shipped).expect("a profile");
+    let text = shipped.replace("execute = 1", "execute = 3").replace("= 224", "= 64");
+    std::fs::write(&profile, text).expect("a file");
+    let profile = format!("--policy-profile={}", profile.display());
+    let episodes = |wire: &str| {
+        let server = Server::of_peer(wire);
+        let policy = format!("--policy={wire}://{}", server.place);
+        evaluate(folder.path(), wire, &["--strategies=sample", &policy, &profile]).remove(0)
+    };
+    let (openpi, vla_eval) = (episodes("openpi"), episodes("vla-eval"));
+    assert_eq!(openpi.steps.len(), vla_eval.steps.len());
+    for (step, (client, server)) in openpi.steps.iter().zip(&vla_eval.steps).enumerate() {
+        assert_eq!(client.action, server.action, "step {step}");
+        assert_eq!(
+            client.decision.is_some(),
+            step % CHUNK == 0,
+            "the record says which steps were decided"
+        );
+        assert!(server.decision.is_some(), "one question per observation");
+    }
+    let first = openpi.steps[0].decision.as_ref().expect("a decision");
+    let actions = first.candidates[0].actions.as_ref().expect("actions");
+    assert_eq!(actions.actions().len(), CHUNK);
+    // Candidates that a policy server draws are listed in the report of the run.
+    let mut report = rever();
+    report.arg("report").arg(folder.path().join("openpi/run"));
+    let output = run(&mut report);
+    assert!(output.status.success(), "{}", text(&output));
+}
+
+#[test]
+fn what_a_policy_server_cannot_do_is_refused_before_anything_starts() {
+    let server = Server::of_peer("openpi");
+    let policy = format!("--policy=openpi://{}", server.place);
+    let nobody = "--policy=vla-eval://127.0.0.1:1".to_owned();
+    for (arguments, expected) in [
+        (
+            vec!["evaluate", &policy, "--strategies=verifier"],
+            "expected a policy that exposes hidden states",
+        ),
+        (vec!["evaluate", &policy, "--strategies=greedy"], "answers = \"greedy\""),
+        (
+            vec!["evaluate", &policy, "--temperature=0.5", "--strategies=sample"],
+            "takes no temperature",
+        ),
+        (vec!["evaluate", &policy, "--policy-profile=brigde"], "did you mean bridge?"),
+        (
+            vec!["collect", &policy, "--unnorm-key=a"],
+            "--unnorm-key a: expected a checkpoint's folder",
+        ),
+        (vec!["train", &policy], "expected a checkpoint's folder, got the policy server"),
+        (vec!["evaluate", "--policy-profile=bridge"], "--policy-profile: expected a policy server"),
+        (vec!["evaluate", &nobody], "policy server vla-eval://127.0.0.1:1: cannot connect"),
+        (vec!["evaluate", "--policy=ws://127.0.0.1:1"], "which of the two does the server speak?"),
+    ] {
+        let output = run(rever().args(&arguments));
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {said}");
+        assert!(said.contains(expected), "{arguments:?}: {said}");
+    }
+}
