@@ -171,7 +171,8 @@ fn check_policy(
     installation: &Installation,
 ) -> Result<(Arc<dyn Policy>, String)> {
     let begun = Instant::now();
-    let LoadedPolicy { policy, checkpoint, .. } = arguments.load_folder(folder.to_owned())?;
+    let LoadedPolicy { policy, checkpoint, .. } =
+        arguments.load_folder(folder.to_owned(), &installation.host)?;
     let PolicyInfo { digest, image_size: (height, width), hidden_size, .. } = policy.info();
     let hidden = hidden_size.map_or("none".to_owned(), |size| size.to_string());
     let mut description = checkpoint.iter().flat_map(|one| one.parser().description());

@@ -18,10 +18,11 @@ use store::plan::{OfferedTask, SeedRange};
 use store::run::{self, Run, RunRequest};
 use tokio::runtime::Runtime;
 use verifier::Verifier;
+use vla::Vla;
 
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use super::policy::{LoadedPolicy, PolicyArguments, verifier_beside};
-use super::{Output, WrongUsage, selection};
+use super::{Output, WrongUsage, cache, selection};
 use crate::files::VERIFIER_FILE;
 use crate::{build_info, files};
 
@@ -151,7 +152,9 @@ impl EpisodesArguments {
         let settings = self.settings(&request, &folder, file.is_some())?;
         let wrong_usage = |error: anyhow::Error| WrongUsage(format!("{error:#}"));
         file.as_deref().map(Verifier::load_any).transpose().map_err(wrong_usage)?;
-        let LoadedPolicy { policy, .. } = self.policy.load_folder(folder.clone())?;
+        let LoadedPolicy { policy, checkpoint, .. } =
+            self.policy.load_folder(folder.clone(), host)?;
+        let sessions = self.sessions_that_fit(checkpoint.as_deref(), &settings)?;
         let digest = policy.info().digest.clone();
         let verifier = file.map(|file| Verifier::load(&file, &digest).map(Arc::new)).transpose();
         let verifier = verifier.map_err(wrong_usage)?;
@@ -163,7 +166,7 @@ impl EpisodesArguments {
         let (tasks, deployment) = match self.recorded_tasks(&request, &settings, &versions) {
             Some(tasks) => (tasks, None),
             None => {
-                let deployment = self.open_servers(&runtime, host)?;
+                let deployment = self.open_servers(&runtime, host, sessions)?;
                 (selection::offered(&self.tasks, &deployment, &runtime)?, Some(deployment))
             }
         };
@@ -192,14 +195,14 @@ impl EpisodesArguments {
             policy,
             scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
             follow_verifier: self.follow_verifier.clone().map(|name| (name, load_scorer(digest))),
-            sessions: usize::from(self.sessions),
+            sessions: usize::from(sessions),
             record: RecordOptions { all_hidden: self.all_hidden, video: self.video },
             versions: build_info::record_versions(),
             is_quiet: request.output.is_quiet,
         };
         let ending = experiment.run(run, &runtime, || match deployment {
             Some(deployment) => Ok(deployment),
-            None => self.open_servers(&runtime, host),
+            None => self.open_servers(&runtime, host, sessions),
         })?;
         let (results, provenance) = results(&run_folder)?;
         Ok(Outcome { folder: run_folder, results, provenance, ending })
@@ -280,6 +283,9 @@ impl EpisodesArguments {
         if let Some(given) = self.policy.source.checkpoint.header() {
             options[POLICY_OPTIONS] = given;
         }
+        if let Some(weights) = self.policy.weights.header() {
+            options["weights"] = weights;
+        }
         options
     }
 
@@ -292,8 +298,18 @@ impl EpisodesArguments {
         })
     }
 
-    fn open_servers(&self, runtime: &Runtime, host: &Host) -> Result<Deployment> {
-        self.servers(host)?.open(runtime, usize::from(self.sessions))
+    /// The number of sessions whose keys and values fit into memory.
+    fn sessions_that_fit(&self, policy: Option<&Vla>, settings: &[Setting]) -> Result<u16> {
+        let candidates = settings.iter().map(|setting| setting.candidates).max().unwrap_or(1);
+        let PolicyArguments { device, kv_cache, .. } = self.policy;
+        match policy {
+            Some(policy) => cache::sessions(policy, device, kv_cache, self.sessions, candidates),
+            None => Ok(self.sessions),
+        }
+    }
+
+    fn open_servers(&self, runtime: &Runtime, host: &Host, sessions: u16) -> Result<Deployment> {
+        self.servers(host)?.open(runtime, usize::from(sessions))
     }
 
     /// The servers to start or to connect to.
