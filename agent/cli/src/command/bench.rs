@@ -1,6 +1,7 @@
 //! `rever bench`: benchmarks of decisions, episodes, the wire and simulators.
 
 mod decision;
+mod parity;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -27,6 +28,7 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Part {
     Decision(decision::Arguments),
+    Parity(parity::Arguments),
     Throughput(ThroughputArguments),
     Wire(WireArguments),
     Simulators(SimulatorsArguments),
@@ -110,6 +112,7 @@ struct StepsArguments {
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     match arguments.part {
         Part::Decision(arguments) => decision::run(arguments, host),
+        Part::Parity(arguments) => parity::run(&arguments, host),
         Part::Throughput(arguments) => throughput(arguments, host),
         Part::Wire(arguments) => wire(arguments, host),
         Part::Simulators(arguments) => simulators(arguments, host),

@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::Result;
 
 use super::*;
+use crate::CompletionParser;
 use crate::checkpoint::config::Config;
 use crate::checkpoint::digest_cache::DigestCache;
 use crate::checkpoint::identity::{Fingerprint, used_tensors};
@@ -35,7 +36,9 @@ fn every_tensor_is_read_once_and_reported() -> Result<()> {
     // norm.
     for (name, dead_weights) in [("tiny", 0), ("tiny-fused", 14 + 12 + 2 * 2)] {
         let (reports, rest) = load_network(&fixtures().join(name))?;
-        let digest = CompletionParser::load(&fixtures().join(name), &LoadOptions::default())?.digest().to_owned();
+        let digest = CompletionParser::load(&fixtures().join(name), &LoadOptions::default())?
+            .digest()
+            .to_owned();
         assert_eq!(rest, Rest { dead_weights, digest: Some(digest), bytes_read_again: 0 });
         assert!(reports.is_sorted_by(|one, next| one.bytes < next.bytes), "{name}: {reports:?}");
         let last = reports.last().expect("a report");
@@ -50,7 +53,9 @@ fn a_file_that_was_cut_is_refused() -> Result<()> {
     let weights = directory.path().join("model.safetensors");
     let length = std::fs::metadata(&weights)?.len();
     std::fs::OpenOptions::new().write(true).open(&weights)?.set_len(length - 1)?;
-    let error = Vla::load(directory.path(), DeviceName::Cpu, &LoadOptions::default()).err().expect("a refusal");
+    let error = Vla::load(directory.path(), DeviceName::Cpu, &LoadOptions::default())
+        .err()
+        .expect("a refusal");
     let expected = format!("safetensors file: expected {length} bytes, got {}", length - 1);
     assert!(format!("{error:#}").ends_with(&expected), "{error:#}");
     Ok(())
@@ -123,7 +128,12 @@ fn a_digest_is_kept_elsewhere_where_the_folder_cannot_be_written() -> Result<()>
 /// The logits of the golden sequence, and the greedy tokens after its prompt.
 fn logits(name: &str, backend: Backend, format: WeightFormat) -> Result<(Tensor, Vec<u32>)> {
     let target = Target { device: Device::Cpu, backend, format };
-    let policy = Vla::load_onto(&fixtures().join(name), &LoadOptions::default(), target, &Loading::default())?;
+    let policy = Vla::load_onto(
+        &fixtures().join(name),
+        &LoadOptions::default(),
+        target,
+        &Loading::default(),
+    )?;
     let golden = Golden::load(&fixtures().join(name).join("activations.safetensors"))?;
     let (image, prompt) = (golden.image("image")?, golden.ids("prompt")?);
     let ids = [prompt.clone(), golden.ids("forced")?].concat();
