@@ -1,6 +1,7 @@
-//! `rever bench`: benchmarks of decisions, episodes, the wire and simulators.
+//! `rever bench`: benchmarks of decisions, the policy server, episodes, the wire and simulators.
 
 mod decision;
+mod policy_server;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -28,6 +29,7 @@ pub struct Arguments {
 enum Part {
     Decision(decision::Arguments),
     Throughput(ThroughputArguments),
+    PolicyServer(policy_server::Arguments),
     Wire(WireArguments),
     Simulators(SimulatorsArguments),
 }
@@ -111,6 +113,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     match arguments.part {
         Part::Decision(arguments) => decision::run(arguments, host),
         Part::Throughput(arguments) => throughput(arguments, host),
+        Part::PolicyServer(arguments) => policy_server::run(arguments, host),
         Part::Wire(arguments) => wire(arguments, host),
         Part::Simulators(arguments) => simulators(arguments, host),
     }?;

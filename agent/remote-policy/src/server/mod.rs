@@ -28,6 +28,7 @@ pub use agent::{AgentOptions, ServedAgent};
 pub use key::ApiKey;
 pub use listen::{MESSAGE_BYTES_MAX, ServerOptions, serve};
 pub use observation::ObservationKeys;
+pub use resize::fit;
 pub use session::Session;
 
 #[cfg(test)]
