@@ -2,7 +2,7 @@
 
 use protocol::message::Image;
 
-use crate::{ActionChunk, Malformed, Reasoning};
+use crate::{ActionChunk, EpisodeToken, Malformed, Reasoning};
 
 /// The input of one decision.
 #[derive(Clone, Copy)]
@@ -19,6 +19,9 @@ pub struct ProposalRequest<'a> {
     pub temperature: f32,
     /// Candidate i is sampled from its own random stream, derived from this seed and i.
     pub seed: u64,
+    /// The episode of this decision; `None` for a decision by itself. A policy server keeps its
+    /// state, and a client the connection, for as long as the episode lasts.
+    pub episode: Option<&'a EpisodeToken>,
 }
 
 /// The candidates of one decision.
@@ -35,12 +38,12 @@ pub struct Candidate {
     /// Empty if the policy does not expose tokens.
     pub tokens: Vec<u32>,
     /// Log-probability of all tokens and of `</s>` at temperature 1, independent of the sampling
-    /// temperature.
+    /// temperature. 0 if the policy exposes neither this nor `log_probabilities`.
     pub log_probability: f32,
-    /// Log-probability of each token at temperature 1.
+    /// Log-probability of each token at temperature 1; empty if the policy does not expose them.
     pub log_probabilities: Vec<f32>,
     /// Log-probability in nats of each section of the reasoning and of each dimension of the
-    /// action.
+    /// action; empty if the policy does not expose them.
     pub confidence: Vec<f32>,
     /// Hidden state of the last token after the final norm; empty if the policy does not expose it.
     pub hidden: Vec<f32>,

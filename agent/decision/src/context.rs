@@ -5,7 +5,7 @@ use std::sync::Arc;
 use protocol::Dimension;
 use sha2::{Digest, Sha256};
 
-use crate::{Action, ActionSpace, ObjectTracker, Scorer, Setting};
+use crate::{Action, ActionSpace, EpisodeName, EpisodeToken, ObjectTracker, Scorer, Setting};
 
 /// The setting and the state of one episode.
 #[derive(Clone)]
@@ -18,6 +18,8 @@ pub struct EpisodeContext {
     pub scorer: Option<Arc<dyn Scorer>>,
     /// Seed of the policy's sampling, the same for every strategy.
     pub sampling_seed: u64,
+    /// The episode's identity, for policies that keep a state between its decisions.
+    pub episode: EpisodeToken,
     /// Seed of the policy's sampling in the next decision, where a client of a policy server gives
     /// one; otherwise it is derived from `sampling_seed` and `step`.
     pub decision_seed: Option<u64>,
@@ -38,11 +40,14 @@ impl EpisodeContext {
         scorer: Option<Arc<dyn Scorer>>,
         action: &[Dimension],
     ) -> EpisodeContext {
+        let instruction = instruction.into();
+        let name = EpisodeName { task: instruction.clone(), episode: 0 };
         EpisodeContext {
             setting,
-            instruction: instruction.into(),
+            instruction,
             scorer,
             sampling_seed,
+            episode: EpisodeToken::new(name),
             decision_seed: None,
             step: 0,
             tracker: ObjectTracker::default(),

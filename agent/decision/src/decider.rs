@@ -212,6 +212,7 @@ fn proposal_request<'a>(request: &'a DecisionRequest<'_>) -> ProposalRequest<'a>
         candidates: context.setting.candidates as usize,
         temperature: context.setting.temperature,
         seed: context.seed(),
+        episode: Some(&context.episode),
     }
 }
 

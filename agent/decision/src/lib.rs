@@ -11,6 +11,7 @@
 
 // Tasks, actions and seeds.
 mod action;
+mod rotation;
 mod seeds;
 mod task;
 
@@ -28,6 +29,7 @@ mod tracker;
 // The complete decision.
 mod context;
 mod decider;
+mod episode;
 
 #[cfg(any(test, feature = "scripted"))]
 pub mod scripted;
@@ -36,9 +38,11 @@ pub use action::{Action, ActionChunk, ActionSpace};
 pub use candidate::{Candidate, CandidateAction, Parsed, Proposal, ProposalRequest};
 pub use context::{EpisodeContext, step_seed};
 pub use decider::{Decider, Decision, DecisionFault, DecisionRequest};
+pub use episode::{EpisodeName, EpisodeToken, EpisodeWatch};
 pub use policy::{Policy, PolicyInfo};
 pub use protocol::message::{Image, Observation};
 pub use reasoning::{Malformed, Reasoning, TAGS, Unread, VisibleObject, last_tag};
+pub use rotation::{quaternion, rotation_vector};
 pub use scorer::{Scorer, ScoringRequest, probability};
 pub use seeds::{episode_hash, episode_name, sampling_seed};
 pub use setting::Setting;

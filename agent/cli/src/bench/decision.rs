@@ -268,8 +268,15 @@ impl DecisionBench<'_> {
         let Setting { candidates, temperature } = setting;
         let (mut prefill_ms, mut step_ms) = (f64::INFINITY, f64::INFINITY);
         for Observation { image, instruction, state, .. } in self.observations {
-            let request =
-                ProposalRequest { image, state, instruction, candidates, temperature, seed: 0 };
+            let request = ProposalRequest {
+                image,
+                state,
+                instruction,
+                candidates,
+                temperature,
+                seed: 0,
+                episode: None,
+            };
             let timings = checkpoint.time(&[request], steps)?;
             prefill_ms = prefill_ms.min(timings.prefill_ms);
             step_ms = step_ms.min(timings.step_ms);

@@ -63,7 +63,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     )?;
     println!("labels: {}", episodes_arguments.labels.display());
     show(&outcome, arguments.json.as_deref(), output)?;
-    let policy = episodes_arguments.policy.source.words();
+    let policy = episodes_arguments.policy.words();
     println!("next: rever train {}{policy}", outcome.folder.display());
     Ok(())
 }

@@ -48,7 +48,10 @@ pub struct Arguments {
 /// Runs the demonstration, then prints its results and the path of its page.
 pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let started = Instant::now();
-    let has_verifier = verifier_beside(&arguments.policy.source.folder(host)?).is_some();
+    let has_verifier = match arguments.policy.source.address() {
+        Some(_) => false,
+        None => verifier_beside(&arguments.policy.source.folder(host)?).is_some(),
+    };
     let (compared, name) = match has_verifier {
         true => (Strategy::Verifier, "the verifier"),
         false => (Strategy::Medoid, "the medoid, because the policy has no verifier"),
@@ -90,7 +93,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
         ResultFile::new(&outcome.results, outcome.provenance.clone())?.write(path)?;
     }
     outcome.ending.ensure_complete(&outcome.folder)?;
-    match arguments.policy.source.words().as_str() {
+    match arguments.policy.words().as_str() {
         "" => println!(
             "next: open the page, or evaluate your own checkpoint: rever evaluate --policy FOLDER"
         ),

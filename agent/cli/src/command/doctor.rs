@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, ensure};
 use clap::Args;
-use decision::{ActionSpace, Image, Policy, PolicyInfo, ProposalRequest};
+use decision::{ActionSpace, Observation, Policy, PolicyInfo, ProposalRequest};
 use protocol::{Open, PROTOCOL_VERSION, Reset};
 use runtime::rollout::first_malformed;
 use runtime::servers::{
@@ -22,7 +22,7 @@ use tokio::runtime::Runtime;
 use verifier::Verifier;
 
 use super::names::{FLEET_DEFAULT, endpoint, fleet, short};
-use super::policy::{LoadedPolicy, PolicyArguments};
+use super::policy::{LoadedPolicy, PolicyArguments, verifier_beside};
 use crate::files;
 
 /// The image size if no policy could be loaded.
@@ -67,7 +67,10 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let mut findings = Vec::new();
     let installation = files::installation_unchanged(host)?;
     let named = arguments.policy.source.policy.clone();
-    let folder = named.unwrap_or_else(|| installation.policy_folder());
+    let folder = match arguments.policy.source.address() {
+        Some(_) => None,
+        None => Some(named.unwrap_or_else(|| installation.policy_folder())),
+    };
     let source = ServerSource {
         local: arguments.connect.is_empty().then_some(LocalSource {
             count: 1,
@@ -87,27 +90,26 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
             program = check(&mut findings, "simulator", || check_simulator(local));
         }
     }
-    let policy =
-        check(&mut findings, "policy", || check_policy(&arguments.policy, &folder, &installation));
+    let policy = check(&mut findings, "policy", || {
+        check_policy(&arguments.policy, folder.as_deref(), &installation, host)
+    });
     if let Some(policy) = &policy {
-        let beside = folder.join(files::VERIFIER_FILE);
-        let named = arguments.verifier.as_deref();
-        if named.is_none() && !beside.is_file() {
-            println!("none  verifier    train one with `rever collect` and `rever train`");
-        } else {
-            let path = named.unwrap_or(&beside);
-            check(&mut findings, "verifier", || {
+        let beside = folder.as_deref().and_then(verifier_beside);
+        match arguments.verifier.as_ref().or(beside.as_ref()) {
+            Some(path) => drop(check(&mut findings, "verifier", || {
                 check_verifier(path, &installation, policy.as_ref())
-            });
+            })),
+            None if folder.is_none() => println!("none  verifier    a policy server has none"),
+            None => println!("none  verifier    train one with `rever collect` and `rever train`"),
         }
     }
     if program.is_some() || source.local.is_none() {
         let size = policy.as_ref().map_or(IMAGE_SIZE_DEFAULT, |policy| policy.info().image_size);
         let runtime = Runtime::new().context("cannot start the async runtime")?;
         let check_environment = || check_environment(&runtime, &source, program, size);
-        let image = check(&mut findings, "environment", check_environment);
-        if let (Some(policy), Some((image, instruction))) = (&policy, image) {
-            let decide = || check_decision(&runtime, policy.as_ref(), &image, &instruction);
+        let observation = check(&mut findings, "environment", check_environment);
+        if let (Some(policy), Some(observation)) = (&policy, observation) {
+            let decide = || check_decision(&runtime, policy.as_ref(), &observation);
             check(&mut findings, "decision", decide);
         }
     }
@@ -118,7 +120,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let failed: Vec<&str> =
         findings.iter().filter(|finding| !finding.is_ok).map(|finding| finding.name).collect();
     ensure!(failed.is_empty(), "not ready: {}", failed.join(", "));
-    println!("ready: try `rever demo{}`", arguments.policy.source.words());
+    println!("ready: try `rever demo{}`", arguments.policy.words());
     Ok(())
 }
 
@@ -167,19 +169,28 @@ fn check_simulator(local: &LocalSource) -> Result<(ServerProgram, String)> {
 
 fn check_policy(
     arguments: &PolicyArguments,
-    folder: &Path,
+    folder: Option<&Path>,
     installation: &Installation,
+    host: &Host,
 ) -> Result<(Arc<dyn Policy>, String)> {
     let begun = Instant::now();
-    let LoadedPolicy { policy, checkpoint, .. } = arguments.load_folder(folder.to_owned())?;
+    let loaded = match folder {
+        Some(folder) => arguments.load_folder(folder.to_owned())?,
+        None => arguments.load(host)?,
+    };
+    let LoadedPolicy { policy, checkpoint, server, name, .. } = loaded;
     let PolicyInfo { digest, image_size: (height, width), hidden_size, .. } = policy.info();
     let hidden = hidden_size.map_or("none".to_owned(), |size| size.to_string());
     let mut description = checkpoint.iter().flat_map(|one| one.parser().description());
     let thought = description.find(|(name, _)| *name == "chain of thought");
     let thought = thought.map_or_else(|| "unknown".to_owned(), |(_, value)| value);
+    let last = match server {
+        Some(server) => format!("profile {}", server.profile_name()),
+        None => format!("chain of thought: {thought}"),
+    };
     let text = format!(
-        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden size {hidden}, chain of thought: {thought}",
-        place(folder, installation),
+        "{}: loaded in {} ms, digest {}, images {height} x {width}, hidden size {hidden}, {last}",
+        folder.map_or(name, |folder| place(folder, installation)),
         begun.elapsed().as_millis(),
         short(digest),
     );
@@ -210,7 +221,7 @@ fn check_environment(
     source: &ServerSource,
     program: Option<ServerProgram>,
     image_size: (usize, usize),
-) -> Result<((Image, String), String)> {
+) -> Result<(Observation, String)> {
     let deployment = source.open_with(program, runtime, 1)?;
     let result = runtime.block_on(try_environment(&deployment, image_size));
     deployment.close(runtime)?;
@@ -220,7 +231,7 @@ fn check_environment(
 async fn try_environment(
     deployment: &Deployment,
     image_size: (usize, usize),
-) -> Result<((Image, String), String)> {
+) -> Result<(Observation, String)> {
     let network = &deployment.network;
     let servers = deployment.first_servers().await?.servers;
     let server = servers.values().next().context("no environment server found")?;
@@ -249,7 +260,7 @@ async fn try_environment(
     let environment = episode.finish();
     environment.close().await?;
     let text = format!("{}; one step took {step_ms:.1} ms", described(server, servers.len()));
-    Ok(((observation.image, observation.instruction), text))
+    Ok((observation, text))
 }
 
 fn described(server: &ServerDescription, servers: usize) -> String {
@@ -266,16 +277,16 @@ fn described(server: &ServerDescription, servers: usize) -> String {
 fn check_decision(
     runtime: &Runtime,
     policy: &dyn Policy,
-    image: &Image,
-    instruction: &str,
+    observation: &Observation,
 ) -> Result<((), String)> {
     let request = ProposalRequest {
-        image,
-        state: &[],
-        instruction,
+        image: &observation.image,
+        state: &observation.state,
+        instruction: &observation.instruction,
         candidates: 5,
         temperature: 1.0,
         seed: 0,
+        episode: None,
     };
     let begun = Instant::now();
     let proposals = runtime.block_on(policy.propose(&[request]))?;

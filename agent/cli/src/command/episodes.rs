@@ -21,7 +21,7 @@ use verifier::Verifier;
 
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use super::policy::{LoadedPolicy, PolicyArguments, verifier_beside};
-use super::{Output, WrongUsage, selection};
+use super::{Output, WrongUsage, policy_server, selection};
 use crate::files::VERIFIER_FILE;
 use crate::{build_info, files};
 
@@ -31,6 +31,8 @@ const SERVERS_DEFAULT: u16 = 2;
 const SESSIONS_DEFAULT: u16 = 16;
 /// The field of a run's header for options of the checkpoint.
 pub const POLICY_OPTIONS: &str = "policy_options";
+/// The field of a run's header for a policy server.
+pub const POLICY_SERVER: &str = "policy_server";
 /// The default label store.
 const LABELS_DEFAULT: &str = "runs/labels.sqlite";
 
@@ -145,13 +147,27 @@ impl Default for EpisodesArguments {
 impl EpisodesArguments {
     /// Runs the episodes that are not recorded yet, then computes the results of all recorded ones.
     pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
-        let folder = self.policy.source.folder(host)?;
-        let file = self.verifier_file(&folder);
+        let server = self.policy.connect(host)?;
+        let folder = match server {
+            Some(_) => None,
+            None => Some(self.policy.source.folder(host)?),
+        };
+        let file = self.verifier_file(folder.as_deref());
         // Before the weights are loaded, which takes minutes for a large checkpoint.
-        let settings = self.settings(&request, &folder, file.is_some())?;
+        let settings = match server.as_ref().and_then(|loaded| loaded.server.as_deref()) {
+            Some(server) => policy_server::possible(server, &request.settings, request.is_default)?,
+            None => request.settings.clone(),
+        };
+        let settings =
+            self.settings(settings, request.is_default, folder.as_deref(), file.is_some())?;
         let wrong_usage = |error: anyhow::Error| WrongUsage(format!("{error:#}"));
         file.as_deref().map(Verifier::load_any).transpose().map_err(wrong_usage)?;
-        let LoadedPolicy { policy, .. } = self.policy.load_folder(folder.clone())?;
+        let LoadedPolicy { policy, server, .. } = match (server, folder) {
+            (Some(loaded), _) => loaded,
+            (None, Some(folder)) => self.policy.load_folder(folder)?,
+            (None, None) => bail!("expected a folder or a policy server"),
+        };
+        let server = server.as_deref().map(policy_server::header).transpose()?;
         let digest = policy.info().digest.clone();
         let verifier = file.map(|file| Verifier::load(&file, &digest).map(Arc::new)).transpose();
         let verifier = verifier.map_err(wrong_usage)?;
@@ -160,14 +176,15 @@ impl EpisodesArguments {
         let runtime = Runtime::new().context("cannot start the async runtime")?;
         let versions = build_info::versions(&digest, verifier.as_deref().map(Verifier::digest));
         let names = |tasks: &[OfferedTask]| tasks.iter().map(|task| task.id.to_string()).collect();
-        let (tasks, deployment) = match self.recorded_tasks(&request, &settings, &versions) {
-            Some(tasks) => (tasks, None),
-            None => {
-                let deployment = self.open_servers(&runtime, host)?;
-                (selection::offered(&self.tasks, &deployment, &runtime)?, Some(deployment))
-            }
-        };
-        let options = self.options(names(&tasks), &request, &settings);
+        let (tasks, deployment) =
+            match self.recorded_tasks(&request, &settings, &versions, server.as_ref()) {
+                Some(tasks) => (tasks, None),
+                None => {
+                    let deployment = self.open_servers(&runtime, host)?;
+                    (selection::offered(&self.tasks, &deployment, &runtime)?, Some(deployment))
+                }
+            };
+        let options = self.options(names(&tasks), &request, &settings, server.as_ref());
         let suite = Suite {
             tasks,
             episodes: request.episodes,
@@ -206,9 +223,9 @@ impl EpisodesArguments {
     }
 
     /// The file of `--verifier`, or else the one beside the policy's weights unless a published one is followed.
-    fn verifier_file(&self, policy: &Path) -> Option<PathBuf> {
+    fn verifier_file(&self, policy: Option<&Path>) -> Option<PathBuf> {
         let beside = || match self.follow_verifier {
-            None => verifier_beside(policy),
+            None => policy.and_then(verifier_beside),
             Some(_) => None,
         };
         self.verifier.clone().or_else(beside)
@@ -217,22 +234,25 @@ impl EpisodesArguments {
     /// The settings to run. Without a verifier, a setting that needs one is wrong usage, or skipped if it is a default.
     fn settings(
         &self,
-        request: &Request,
-        policy: &Path,
+        settings: Vec<Setting>,
+        is_default: bool,
+        policy: Option<&Path>,
         has_verifier: bool,
     ) -> Result<Vec<Setting>> {
-        let settings = &request.settings;
         let is_possible = |setting: &Setting| {
             !setting.strategy.needs_verifier() || has_verifier || self.follow_verifier.is_some()
         };
         let Some(setting) = settings.iter().find(|setting| !is_possible(setting)) else {
-            return Ok(settings.clone());
+            return Ok(settings);
         };
-        let remedy = format!(
-            "there is no {VERIFIER_FILE} in {}; train one with `rever collect --policy {0}` and `rever train --policy {0}`",
-            policy.display()
-        );
-        if !request.is_default {
+        let remedy = match policy {
+            Some(policy) => format!(
+                "there is no {VERIFIER_FILE} in {}; train one with `rever collect --policy {0}` and `rever train --policy {0}`",
+                policy.display()
+            ),
+            None => "a policy server has no folder with one".to_owned(),
+        };
+        if !is_default {
             let strategy = setting.strategy;
             bail!(WrongUsage(format!(
                 "strategy {strategy}: expected a verifier (--verifier FILE), got none: {remedy}"
@@ -248,12 +268,13 @@ impl EpisodesArguments {
         request: &Request,
         settings: &[Setting],
         versions: &Value,
+        server: Option<&Value>,
     ) -> Option<Vec<OfferedTask>> {
         if self.tasks.is_empty() || request.layouts == Layouts::Grid {
             return None;
         }
         let typed = self.tasks.iter().map(TaskId::to_string).collect();
-        let options = self.options(typed, request, settings);
+        let options = self.options(typed, request, settings, server);
         let folder = self.run_folder(request.title, &options, versions);
         let header = run::read_header(&folder).ok()?;
         let tasks = selection::matching(&self.tasks, &tasks_in_order(&header.options)).ok()?;
@@ -262,7 +283,13 @@ impl EpisodesArguments {
     }
 
     /// Everything that determines the results, by name. Servers and concurrency do not.
-    fn options(&self, tasks: Vec<String>, request: &Request, settings: &[Setting]) -> Value {
+    fn options(
+        &self,
+        tasks: Vec<String>,
+        request: &Request,
+        settings: &[Setting],
+        server: Option<&Value>,
+    ) -> Value {
         let mut options = json!({
             "tasks": tasks,
             "episodes": request.episodes,
@@ -279,6 +306,9 @@ impl EpisodesArguments {
         // The policy's digest covers them; a run without them has the header that it always had.
         if let Some(given) = self.policy.source.checkpoint.header() {
             options[POLICY_OPTIONS] = given;
+        }
+        if let Some(server) = server {
+            options[POLICY_SERVER] = server.clone();
         }
         options
     }

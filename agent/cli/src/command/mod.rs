@@ -12,6 +12,7 @@ mod evaluate;
 mod list;
 mod names;
 mod policy;
+mod policy_server;
 mod report;
 mod selection;
 mod serve_policy;

@@ -8,12 +8,14 @@ use anyhow::Result;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use decision::Policy;
+use remote_policy::{Address, RemotePolicy};
 use runtime::servers::Host;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use vla::{CompletionParser, DeviceName, LoadOptions, ReasoningMode, Vla};
 
 use super::WrongUsage;
+use super::policy_server::ServerArguments;
 use crate::files::{self, VERIFIER_FILE};
 
 /// Which policy, and what it runs on.
@@ -25,14 +27,17 @@ pub struct PolicyArguments {
     /// Device that the policy runs on: cpu, cuda or cuda:N
     #[arg(long, default_value_t)]
     pub device: DeviceName,
+    #[command(flatten)]
+    pub server: ServerArguments,
 }
 
 /// Which policy, and how its files are read.
 #[derive(Debug, Clone, Default, Args)]
 #[command(next_help_heading = "Policy and verifier")]
 pub struct PolicySource {
-    /// Folder of the checkpoint [default: the policy that comes with rever]
-    #[arg(long, value_name = "FOLDER")]
+    /// Folder of the checkpoint, or a policy server: openpi://HOST:PORT, vla-eval://HOST:PORT or http://HOST:PORT/act
+    /// [default: the policy that comes with rever]
+    #[arg(long, value_name = "FOLDER|URL")]
     pub policy: Option<PathBuf>,
     #[command(flatten)]
     pub checkpoint: CheckpointArguments,
@@ -69,6 +74,8 @@ pub struct LoadedPolicy {
     pub checkpoint: Option<Arc<Vla>>,
     /// The checkpoint's folder, which may hold a verifier.
     pub folder: Option<PathBuf>,
+    /// The same policy, if it is a policy server.
+    pub server: Option<Arc<RemotePolicy>>,
     /// The name to show: a folder or an address.
     pub name: String,
 }
@@ -76,7 +83,32 @@ pub struct LoadedPolicy {
 impl PolicyArguments {
     /// Loads the policy, or the one that comes with the program.
     pub fn load(&self, host: &Host) -> Result<LoadedPolicy> {
+        if let Some(loaded) = self.connect(host)? {
+            return Ok(loaded);
+        }
         self.load_folder(self.source.folder(host)?)
+    }
+
+    /// Connects to the policy server, if the policy is one.
+    pub fn connect(&self, host: &Host) -> Result<Option<LoadedPolicy>> {
+        let Some(address) = self.source.address() else {
+            self.server.ensure_unused()?;
+            return Ok(None);
+        };
+        let options = self.source.checkpoint.words();
+        if !options.is_empty() {
+            return Err(WrongUsage(format!(
+                "{}: expected a checkpoint's folder, got the policy server {address}, which has its own options",
+                options.trim()
+            ))
+            .into());
+        }
+        self.server.connect(&address, host).map(Some)
+    }
+
+    /// The arguments of this policy for a further command, with a space before them.
+    pub fn words(&self) -> String {
+        self.source.words() + &self.server.words()
     }
 
     /// Loads the checkpoint in a folder that [`PolicySource`] has chosen.
@@ -88,6 +120,7 @@ impl PolicyArguments {
         Ok(LoadedPolicy {
             policy: Arc::clone(&policy) as Arc<dyn Policy>,
             checkpoint: Some(policy),
+            server: None,
             name: folder.display().to_string(),
             folder: Some(folder),
         })
@@ -95,8 +128,20 @@ impl PolicyArguments {
 }
 
 impl PolicySource {
+    /// The address of the policy server, if the policy is meant as one.
+    pub fn address(&self) -> Option<String> {
+        let text = self.policy.as_ref()?.to_str()?;
+        Address::is_meant(text).then(|| text.to_owned())
+    }
+
     /// The folder of the checkpoint, or of the one that comes with the program.
     pub fn folder(&self, host: &Host) -> Result<PathBuf> {
+        if let Some(address) = self.address() {
+            return Err(WrongUsage(format!(
+                "--policy: expected a checkpoint's folder, got the policy server {address}"
+            ))
+            .into());
+        }
         let folder = files::policy_folder(self.policy.as_ref(), host)?;
         ensure_folder(&folder)?;
         Ok(folder)

@@ -9,10 +9,10 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::episodes::POLICY_OPTIONS;
+use super::episodes::{POLICY_OPTIONS, POLICY_SERVER};
 use super::policy::PolicySource;
 use crate::files::installation;
-use evaluation::report::{self, Readers, Report, ReportOptions, Speech};
+use evaluation::report::{self, EpisodeTerms, Readers, Report, ReportOptions, Speech};
 use runtime::servers::{Host, LocalSource, Simulator};
 use store::record::EpisodeRecord;
 use store::run;
@@ -106,6 +106,11 @@ fn build_with(
     let header = run::read_header(options.run)?;
     let digest = header.versions["policy"].as_str();
     let digest = digest.context("run.json: expected the digest of a policy, got none")?;
+    // Only a checkpoint that is named can read the tokens of a policy server, if there are any.
+    let is_named = policy.policy.is_some() && policy.address().is_none();
+    if header.options.get(POLICY_SERVER).is_some() && !is_named {
+        return build_report(options, &silent());
+    }
     let parser = policy.parser_of_run(header.options.get(POLICY_OPTIONS), digest, host)?;
     ensure_parser_of(options.run, &parser)?;
     let speak = |tokens: &[u32]| Speech {
@@ -114,14 +119,26 @@ fn build_with(
     };
     let terms = ScoreTerms::load(verifier, &policy.folder(host)?, &parser)?;
     let explain = |record: &_| terms.of(record);
-    let readers = Readers { speak: &speak, terms: terms.names(), explain: &explain };
+    build_report(options, &Readers { speak: &speak, terms: terms.names(), explain: &explain })
+}
+
+/// For a policy server, which sends no text that a record holds.
+fn silent() -> Readers<'static> {
+    Readers {
+        speak: &|_| Speech { text: String::new(), reasoning: None },
+        terms: Vec::new(),
+        explain: &|_| Ok(EpisodeTerms::Unknown("The policy was a policy server.".to_owned())),
+    }
+}
+
+fn build_report(options: &ReportOptions<'_>, readers: &Readers<'_>) -> Result<Report> {
     let bar = ProgressBar::no_length().with_prefix("report");
     bar.set_style(bar_style());
     let progress = |done: usize, total: usize| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
     };
-    let report = report::build(options, &readers, &progress);
+    let report = report::build(options, readers, &progress);
     bar.finish_and_clear();
     report
 }

@@ -16,7 +16,11 @@ pub fn actions(value: &Value<'_>) -> Result<Vec<Vec<f32>>> {
 }
 
 fn read(value: &Value<'_>) -> Result<Vec<Vec<f32>>> {
-    let array = Array::from_value(value)?;
+    actions_of(&Array::from_value(value)?)
+}
+
+/// As [`actions`], of a decoded array.
+pub fn actions_of(array: &Array<'_>) -> Result<Vec<Vec<f32>>> {
     let mut shape = &array.shape[..];
     while let [1, rest @ ..] = shape
         && rest.len() > 1

@@ -3,7 +3,7 @@
 
 use anyhow::{Context, Result, bail, ensure};
 
-use super::{Array, KeyForm, Value, actions, printable};
+use super::{Array, IMAGE_SIDE_MAX, KeyForm, Value, actions, printable};
 
 /// The key of all fields.
 pub const KEY: &str = "rever";
@@ -27,6 +27,8 @@ pub struct Announcement {
     pub digest: Option<String>,
     /// Whether temperature 0 gives the most likely action.
     pub is_greedy: bool,
+    /// Height and width of the images that the policy sees.
+    pub image_size: Option<(usize, usize)>,
     /// Length of a candidate's hidden state.
     pub hidden_size: Option<usize>,
     /// Number of parts in a candidate's confidence.
@@ -105,6 +107,7 @@ impl Announcement {
                 candidates_max: candidates_max.min(CANDIDATES_MAX),
                 digest: text(fields, "digest", NAME_BYTES_MAX)?,
                 is_greedy: matches!(fields.get("greedy"), Some(Value::Bool(true))),
+                image_size: image_size(fields)?,
                 hidden_size: count(fields, "hidden_size")?,
                 confidence_size: count(fields, "confidence_size")?,
                 action_scale: some(numbers(fields, "action_scale")?),
@@ -121,6 +124,10 @@ impl Announcement {
             ("greedy", Value::Bool(self.is_greedy)),
         ];
         put_text(&mut fields, "digest", self.digest.as_deref());
+        if let Some((height, width)) = self.image_size {
+            let sides = [height, width].map(|side| Value::Integer(side as i128));
+            fields.push(("image_size", Value::List(sides.to_vec())));
+        }
         let counts = [("hidden_size", self.hidden_size), ("confidence_size", self.confidence_size)];
         for (name, count) in counts {
             fields.extend(count.map(|count| (name, Value::Integer(count as i128))));
@@ -304,6 +311,21 @@ fn count(fields: &Value<'_>, name: &'static str) -> Result<Option<usize>> {
     let count: usize = value.as_integer().context(name)?;
     ensure!(count <= NUMBERS_MAX, "{name}: expected at most {NUMBERS_MAX}, got {count}");
     Ok(Some(count))
+}
+
+fn image_size(fields: &Value<'_>) -> Result<Option<(usize, usize)>> {
+    let Some(value) = optional(fields, "image_size") else { return Ok(None) };
+    let sides = match value {
+        Value::List(sides) => sides.iter().map(Value::as_integer).collect::<Result<Vec<usize>>>(),
+        other => bail!("image_size: expected a list, got {}", other.kind()),
+    };
+    let sides = sides.context("image_size")?;
+    match sides[..] {
+        [height, width] if sides.iter().all(|side| (1..=IMAGE_SIDE_MAX).contains(side)) => {
+            Ok(Some((height, width)))
+        }
+        _ => bail!("image_size: expected two numbers from 1 to {IMAGE_SIDE_MAX}, got {sides:?}"),
+    }
 }
 
 fn number(fields: &Value<'_>, name: &'static str) -> Result<Option<f32>> {

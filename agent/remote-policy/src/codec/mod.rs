@@ -12,7 +12,7 @@ mod value;
 pub mod vla_eval;
 mod write;
 
-pub use actions::{DIMENSIONS_MAX, STEPS_MAX, actions_array};
+pub use actions::{DIMENSIONS_MAX, STEPS_MAX, actions_array, actions_of};
 pub use array::{Array, Dtype};
 pub use image::{IMAGE_SIDE_MAX, ImageForm, decode_image, image_value};
 pub use read::{DEPTH_MAX, FRAME_BYTES_MAX, ITEMS_MAX, decode};

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicUsize;
 
 use anyhow::{Result, bail, ensure};
 use batching::DecisionBatcher;
-use decision::{Decider, EpisodeContext, Policy, PolicyInfo, Scorer, Setting, sampling_seed};
+use decision::{Decider, EpisodeContext, Policy, PolicyInfo, Scorer, Setting, TAGS, sampling_seed};
 use protocol::Dimension;
 
 use super::action_form::ActionForm;
@@ -134,8 +134,9 @@ impl ServedAgent {
             candidates_max: self.candidates_max() as usize,
             digest: Some(info.digest.clone()),
             is_greedy: true,
+            image_size: Some(info.image_size).filter(|(height, width)| height * width > 0),
             hidden_size: info.hidden_size,
-            confidence_size: None,
+            confidence_size: info.hidden_size.map(|_| TAGS.len() + info.action_space.length()),
             action_scale: Some(info.action_space.scale.clone()),
         }
     }

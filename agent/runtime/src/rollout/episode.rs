@@ -5,7 +5,10 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use batching::{Answer, DecisionBatcher};
-use decision::{Candidate, Decision, EpisodeContext, Observation, Policy, Scorer, probability};
+use decision::{
+    Candidate, Decision, EpisodeContext, EpisodeName, EpisodeToken, Observation, Policy, Scorer,
+    probability,
+};
 use protocol::{Reset, TaskDescription};
 use store::queue::Lease;
 use store::record::{
@@ -86,17 +89,17 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
     ) -> Result<Progress, AttemptFault> {
         let observation = episode.observation();
         self.emit_frame(observation, true).await?;
-        let mut progress = Progress {
-            context: EpisodeContext::new(
-                self.lease.job.setting,
-                self.lease.job.identity.sampling_seed,
-                observation.instruction.clone(),
-                self.scorer.clone(),
-                &info.task.action,
-            ),
-            steps: Vec::new(),
-            is_over: false,
-        };
+        let identity = &self.lease.job.identity;
+        let mut context = EpisodeContext::new(
+            self.lease.job.setting,
+            identity.sampling_seed,
+            observation.instruction.clone(),
+            self.scorer.clone(),
+            &info.task.action,
+        );
+        let task = identity.task_id().to_string();
+        context.episode = EpisodeToken::new(EpisodeName { task, episode: identity.episode });
+        let mut progress = Progress { context, steps: Vec::new(), is_over: false };
         while !progress.is_over {
             progress = self.step(episode, info, progress).await?;
         }

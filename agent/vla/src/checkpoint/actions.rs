@@ -1,6 +1,8 @@
 //! Action tokens: OpenVLA's bins and their conversion to metres, rotation vector and gripper
 //! command.
 
+use decision::rotation_vector;
+
 use crate::checkpoint::config::{ACTION_LENGTH, ActionScale};
 
 /// The token ids of actions and their meaning.
@@ -54,26 +56,6 @@ impl ActionBins {
         }
         units
     }
-}
-
-/// The rotation vector of a rotation about the fixed axes: roll about x, then pitch about y, then
-/// yaw about z.
-pub fn rotation_vector(roll: f64, pitch: f64, yaw: f64) -> [f64; 3] {
-    let (sr, cr) = (roll / 2.0).sin_cos();
-    let (sp, cp) = (pitch / 2.0).sin_cos();
-    let (sy, cy) = (yaw / 2.0).sin_cos();
-    let mut w = cr * cp * cy + sr * sp * sy;
-    let mut axis =
-        [sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy];
-    if w < 0.0 {
-        // The same rotation with the smaller angle.
-        w = -w;
-        axis = axis.map(|number| -number);
-    }
-    let sine = axis.iter().map(|number| number * number).sum::<f64>().sqrt();
-    // Near zero, angle / sin(angle / 2) approaches 2.
-    let factor = if sine < 1e-9 { 2.0 } else { 2.0 * sine.atan2(w) / sine };
-    axis.map(|number| number * factor)
 }
 
 #[cfg(test)]

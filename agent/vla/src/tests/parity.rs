@@ -104,6 +104,7 @@ fn the_shipped_model_equals_pytorch_on_recorded_observations() -> Result<()> {
             candidates: 1,
             temperature: 0.0,
             seed: 0,
+            episode: None,
         };
         let candidate = policy.propose_now(&[request])?.remove(0).candidates.remove(0);
         assert_eq!(candidate.tokens, expected[..expected.len() - 1], "observation {index}");

@@ -17,7 +17,15 @@ fn image(seed: u8, side: usize) -> Image {
 }
 
 fn request(image: &Image, candidates: usize, temperature: f32, seed: u64) -> ProposalRequest<'_> {
-    ProposalRequest { image, state: &[], instruction: INSTRUCTION, candidates, temperature, seed }
+    ProposalRequest {
+        image,
+        state: &[],
+        instruction: INSTRUCTION,
+        candidates,
+        temperature,
+        seed,
+        episode: None,
+    }
 }
 
 #[test]

@@ -193,6 +193,7 @@ fn the_optional_fields_are_read_back_and_checked() {
             candidates_max: 5,
             digest: Some("477a".to_owned()),
             is_greedy: true,
+            image_size: Some((224, 128)),
             hidden_size: Some(64),
             confidence_size: Some(16),
             action_scale: Some(vec![0.5; 7]),

@@ -1,0 +1,1 @@
+//! Clients against scripted servers on real sockets.
