@@ -212,7 +212,7 @@ fn request(wire: usize, observation: &Observation, seed: u64) -> Result<Vec<u8>>
     ))
 }
 
-fn message<'a>(kind: &'static str, payload: Value<'a>) -> Value<'a> {
+fn message(kind: &'static str, payload: Value<'_>) -> Value<'_> {
     Value::map([
         ("type", Value::text(kind)),
         ("payload", payload),
