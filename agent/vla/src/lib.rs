@@ -26,10 +26,12 @@ mod generate;
 
 pub use checkpoint::completion::CompletionParser;
 pub use checkpoint::options::{LoadOptions, ReasoningMode};
+pub use checkpoint::weights::Loaded;
 pub use generate::timings::Timings;
 pub use kernels::backend::Backend;
 pub use kernels::device::DeviceName;
-pub use policy::Vla;
+pub use kernels::matmul::WeightFormat;
+pub use policy::{Loading, Vla};
 
 #[cfg(test)]
 mod tests;
