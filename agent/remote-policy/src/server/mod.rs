@@ -29,7 +29,6 @@ pub use key::ApiKey;
 pub use listen::{MESSAGE_BYTES_MAX, ServerOptions, serve};
 pub use observation::ObservationKeys;
 pub use resize::fit;
-pub use session::Session;
 
 #[cfg(test)]
 mod tests;
