@@ -1,7 +1,8 @@
-//! `rever bench`: benchmarks of decisions, episodes, the wire and simulators.
+//! `rever bench`: benchmarks of decisions, the policy server, episodes, the wire and simulators.
 
 mod decision;
 mod parity;
+mod policy_server;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -30,6 +31,7 @@ enum Part {
     Decision(decision::Arguments),
     Parity(parity::Arguments),
     Throughput(ThroughputArguments),
+    PolicyServer(policy_server::Arguments),
     Wire(WireArguments),
     Simulators(SimulatorsArguments),
 }
@@ -114,6 +116,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         Part::Decision(arguments) => decision::run(arguments, host),
         Part::Parity(arguments) => parity::run(&arguments, host),
         Part::Throughput(arguments) => throughput(arguments, host),
+        Part::PolicyServer(arguments) => policy_server::run(arguments, host),
         Part::Wire(arguments) => wire(arguments, host),
         Part::Simulators(arguments) => simulators(arguments, host),
     }?;
