@@ -49,5 +49,8 @@ mod report_page;
 // The time of decisions.
 mod bench;
 
+// The agent as a policy server, and the peers' own programs.
+mod serve_policy;
+
 // A new verifier during a run.
 mod hot_swap;

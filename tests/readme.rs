@@ -180,12 +180,11 @@ fn short_commands_of_the_readme_run() {
 }
 
 #[test]
-fn readmes_example_runs() {
-    let readme = read("README.md");
+fn the_first_example_of_env_server_runs() {
+    let readme = read("env-server/README.md");
     let examples = fenced(&readme, "python");
-    assert_eq!(examples.len(), 1, "README has one example in Python");
     let said = succeed(python().command().args(["-c", examples[0]]));
-    assert!(["success\n", "failure\n"].contains(&said.as_str()), "{said:?}");
+    assert!(said.ends_with("\nsuccess\n") || said.ends_with("\nfailure\n"), "{said:?}");
 }
 
 #[test]

@@ -114,7 +114,11 @@ class ReverBenchmark(StepBenchmark):  # type: ignore[misc] # vla-eval has no typ
         observation, reward, terminated, truncated, info = self._env.step(numbers)
         self._recorder.record_video(observation["image"])
         self._recorder.record_step(
-            reward=reward, terminated=terminated, truncated=truncated, success=info["is_success"]
+            action=numbers.tolist(),
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            success=info["is_success"],
         )
         return StepResult(observation, reward, terminated or truncated, info)
 

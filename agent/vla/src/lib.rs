@@ -11,7 +11,8 @@
 //! Weights are immutable; caches are passed as values. The result for a request does not depend on
 //! the other requests of the batch.
 
-// The checkpoint as a policy.
+// The checkpoint as a policy, and what it is compared with.
+mod parity;
 mod policy;
 
 // The checkpoint's files: configuration, tokenizer, prompt, reasoning, action bins, weights.
@@ -26,10 +27,13 @@ mod generate;
 
 pub use checkpoint::completion::CompletionParser;
 pub use checkpoint::options::{LoadOptions, ReasoningMode};
+pub use checkpoint::weights::Loaded;
 pub use generate::timings::Timings;
 pub use kernels::backend::Backend;
 pub use kernels::device::DeviceName;
-pub use policy::Vla;
+pub use kernels::matmul::WeightFormat;
+pub use parity::GreedyTrace;
+pub use policy::{Loading, Vla};
 
 #[cfg(test)]
 mod tests;

@@ -9,16 +9,25 @@ use candle_core::{Device, Tensor};
 use decision::{Candidate, Image, Policy, PolicyInfo, Proposal, ProposalRequest};
 
 use crate::checkpoint::completion::CompletionParser;
+use crate::checkpoint::config::{Config, TowerConfig};
+use crate::checkpoint::digest_cache::DigestCache;
+use crate::checkpoint::identity::{Fingerprint, used_tensors};
 use crate::checkpoint::options::LoadOptions;
+use crate::checkpoint::shards::Shards;
+use crate::checkpoint::weights::{Loaded, Target, Weights};
 use crate::generate::decode_loop::{Continuation, Limits};
 use crate::generate::timings::{self, Timings};
 use crate::generate::worker_pools::WorkerPools;
 use crate::kernels::backend::Backend;
 use crate::kernels::device::DeviceName;
+use crate::kernels::matmul::WeightFormat;
 use crate::network::center_crop::center_crop;
 use crate::network::decoder::Wanted;
 use crate::network::forward::{Context, Network};
 use crate::network::trace::Trace;
+
+/// Tokens of an instruction, for the size of caches; SIMPLER's have about ten.
+const INSTRUCTION_TOKENS: usize = 64;
 
 /// A loaded checkpoint.
 pub struct Vla {
@@ -28,12 +37,52 @@ pub struct Vla {
     info: PolicyInfo,
 }
 
+/// Where and how the weights of a checkpoint are loaded.
+#[derive(Clone, Copy)]
+pub struct Loading<'a> {
+    /// The device of the network.
+    pub device: DeviceName,
+    /// The format of the decoder's matrices.
+    pub weights: WeightFormat,
+    /// Folder for the digests of checkpoints in folders that cannot be written.
+    pub digests: Option<&'a Path>,
+    /// Called after each tensor.
+    pub report: &'a dyn Fn(Loaded),
+}
+
+impl Default for Loading<'_> {
+    fn default() -> Self {
+        Loading {
+            device: DeviceName::Cpu,
+            weights: WeightFormat::Exact,
+            digests: None,
+            report: &|_| {},
+        }
+    }
+}
+
 impl Vla {
     /// Loads a checkpoint folder onto a device: config.json, model.safetensors (or shards),
     /// tokenizer.json.
     pub fn load(directory: &Path, device: DeviceName, options: &LoadOptions) -> Result<Vla> {
-        let device = device.open()?;
-        Vla::load_on(directory, &device, Backend::for_device(&device), options)
+        Vla::load_with(directory, options, &Loading { device, ..Loading::default() })
+    }
+
+    /// Loads a checkpoint folder. Tensors are read one at a time, and hashed while the network is
+    /// made of them unless the digest is known.
+    pub fn load_with(
+        directory: &Path,
+        options: &LoadOptions,
+        loading: &Loading<'_>,
+    ) -> Result<Vla> {
+        let device = loading.device.open()?;
+        let (backend, format) = (Backend::for_device(&device), loading.weights);
+        ensure!(
+            format == WeightFormat::Exact || backend == Backend::Kernels,
+            "weights in 8 bits: expected the device cpu, got {}",
+            loading.device
+        );
+        Vla::load_onto(directory, options, Target { device, backend, format }, loading)
     }
 
     /// Loads a checkpoint folder onto an open device, with the given backend.
@@ -43,11 +92,38 @@ impl Vla {
         backend: Backend,
         options: &LoadOptions,
     ) -> Result<Vla> {
+        let target = Target { device: device.clone(), backend, format: WeightFormat::Exact };
+        Vla::load_onto(directory, options, target, &Loading::default())
+    }
+
+    pub(crate) fn load_onto(
+        directory: &Path,
+        options: &LoadOptions,
+        target: Target,
+        loading: &Loading<'_>,
+    ) -> Result<Vla> {
         let load = || -> Result<Vla> {
-            let parser = CompletionParser::load(directory, options)?;
-            let network = Network::load(directory, &parser.config, device, backend)?;
+            let none = |_: &Config| Ok(String::new());
+            let mut parser = CompletionParser::load_with(directory, options, none)?;
+            let fingerprint = Fingerprint::of(directory, &parser.config)?;
+            let cache = DigestCache::open(directory, loading.digests)?;
+            let shards = Shards::open(directory)?;
+            let known = cache.digest(&fingerprint);
+            let hashing = match known {
+                Some(_) => None,
+                None => Some(fingerprint.start(&shards, &parser.config)?),
+            };
+            let used = used_tensors(&shards, &parser.config);
+            let backend = target.backend;
+            let weights = Weights::new(&shards, &used, hashing, target, loading.report);
+            let (network, rest) = Network::load(weights, &parser.config)?;
+            if let Some(digest) = &rest.digest {
+                cache.keep(&fingerprint, digest);
+            }
+            parser.digest = rest.digest.or(known).context("the digest was not computed")?;
             tracing::debug!(
-                dead_weights = network.dead_weights,
+                rest.dead_weights,
+                rest.bytes_read_again,
                 digest = parser.digest(),
                 "policy loaded"
             );
@@ -139,6 +215,15 @@ impl Vla {
     /// Bytes of weights that one decode step reads, independent of the number of rows.
     pub fn step_bytes(&self) -> usize {
         self.network.decoder.step_bytes()
+    }
+
+    /// Upper bound of the bytes of keys and values of one session with this number of candidates:
+    /// image and prompt once, a completion of maximum length for each candidate.
+    pub fn cache_bytes(&self, candidates: usize) -> Result<usize> {
+        let side = self.parser.config.towers.first().map_or(0, TowerConfig::side);
+        let prompt = self.parser.prompter.ids("")?.len() + INSTRUCTION_TOKENS;
+        let tail = self.tokens_max(prompt) + 1;
+        Ok(self.network.decoder.cache_bytes(side * side + prompt, candidates, tail))
     }
 
     /// Maximum number of tokens after a prompt of this length and the image.

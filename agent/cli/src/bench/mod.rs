@@ -5,6 +5,7 @@
 mod bandwidth;
 mod decision;
 mod observations;
+mod policy_server;
 mod simulators;
 mod throughput;
 mod torch;
@@ -12,6 +13,7 @@ mod wire;
 
 pub use decision::{DecisionBench, NetworkRow, Report, Row as DecisionRow};
 pub use observations::{read as read_observations, scaled};
+pub use policy_server::{PolicyServerBench, Row as PolicyServerRow};
 pub use simulators::{Row as SimulatorsRow, SimulatorsBench};
 pub use throughput::{Row as ThroughputRow, ThroughputBench};
 pub use torch::Torch;

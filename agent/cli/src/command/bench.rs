@@ -1,6 +1,8 @@
-//! `rever bench`: benchmarks of decisions, episodes, the wire and simulators.
+//! `rever bench`: benchmarks of decisions, the policy server, episodes, the wire and simulators.
 
 mod decision;
+mod parity;
+mod policy_server;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -27,7 +29,9 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Part {
     Decision(decision::Arguments),
+    Parity(parity::Arguments),
     Throughput(ThroughputArguments),
+    PolicyServer(policy_server::Arguments),
     Wire(WireArguments),
     Simulators(SimulatorsArguments),
 }
@@ -110,7 +114,9 @@ struct StepsArguments {
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     match arguments.part {
         Part::Decision(arguments) => decision::run(arguments, host),
+        Part::Parity(arguments) => parity::run(&arguments, host),
         Part::Throughput(arguments) => throughput(arguments, host),
+        Part::PolicyServer(arguments) => policy_server::run(arguments, host),
         Part::Wire(arguments) => wire(arguments, host),
         Part::Simulators(arguments) => simulators(arguments, host),
     }?;

@@ -175,7 +175,7 @@ fn check_policy(
 ) -> Result<(Arc<dyn Policy>, String)> {
     let begun = Instant::now();
     let loaded = match folder {
-        Some(folder) => arguments.load_folder(folder.to_owned())?,
+        Some(folder) => arguments.load_folder(folder.to_owned(), host)?,
         None => arguments.load(host)?,
     };
     let LoadedPolicy { policy, checkpoint, server, name, .. } = loaded;

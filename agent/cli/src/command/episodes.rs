@@ -20,10 +20,11 @@ use store::plan::{OfferedTask, SeedRange};
 use store::run::{self, Run, RunRequest};
 use tokio::runtime::Runtime;
 use verifier::Verifier;
+use vla::Vla;
 
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet};
 use super::policy::PolicyArguments;
-use super::{Output, WrongUsage, selection};
+use super::{Output, WrongUsage, cache, selection};
 use crate::{build_info, files};
 use ready::Ready;
 
@@ -149,7 +150,8 @@ impl Default for EpisodesArguments {
 impl EpisodesArguments {
     /// Runs the episodes that are not recorded yet, then computes the results of all recorded ones.
     pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
-        let Ready { policy, settings, verifier, server } = self.ready(&request, host)?;
+        let Ready { policy, checkpoint, settings, verifier, server } = self.ready(&request, host)?;
+        let sessions = self.sessions_that_fit(checkpoint.as_deref(), &settings)?;
         let digest = policy.info().digest.clone();
         // Opened now, so that a label store that cannot be used fails before any episode runs.
         LabelStore::open(&self.labels).map(drop)?;
@@ -160,7 +162,7 @@ impl EpisodesArguments {
             match self.recorded_tasks(&request, &settings, &versions, server.as_ref()) {
                 Some(tasks) => (tasks, None),
                 None => {
-                    let deployment = self.open_servers(&runtime, host)?;
+                    let deployment = self.open_servers(&runtime, host, sessions)?;
                     (selection::offered(&self.tasks, &deployment, &runtime)?, Some(deployment))
                 }
             };
@@ -189,14 +191,14 @@ impl EpisodesArguments {
             policy,
             scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
             follow_verifier: self.follow_verifier.clone().map(|name| (name, load_scorer(digest))),
-            sessions: usize::from(self.sessions),
+            sessions: usize::from(sessions),
             record: RecordOptions { all_hidden: self.all_hidden, video: self.video },
             versions: build_info::record_versions(),
             is_quiet: request.output.is_quiet,
         };
         let ending = experiment.run(run, &runtime, || match deployment {
             Some(deployment) => Ok(deployment),
-            None => self.open_servers(&runtime, host),
+            None => self.open_servers(&runtime, host, sessions),
         })?;
         let (results, provenance) = results(&run_folder)?;
         Ok(Outcome { folder: run_folder, results, provenance, ending })
@@ -250,6 +252,9 @@ impl EpisodesArguments {
         if let Some(server) = server {
             options[POLICY_SERVER] = server.clone();
         }
+        if let Some(weights) = self.policy.weights.header() {
+            options["weights"] = weights;
+        }
         options
     }
 
@@ -262,8 +267,18 @@ impl EpisodesArguments {
         })
     }
 
-    fn open_servers(&self, runtime: &Runtime, host: &Host) -> Result<Deployment> {
-        self.servers(host)?.open(runtime, usize::from(self.sessions))
+    /// The number of sessions whose keys and values fit into memory.
+    fn sessions_that_fit(&self, policy: Option<&Vla>, settings: &[Setting]) -> Result<u16> {
+        let candidates = settings.iter().map(|setting| setting.candidates).max().unwrap_or(1);
+        let PolicyArguments { device, kv_cache, .. } = self.policy;
+        match policy {
+            Some(policy) => cache::sessions(policy, device, kv_cache, self.sessions, candidates),
+            None => Ok(self.sessions),
+        }
+    }
+
+    fn open_servers(&self, runtime: &Runtime, host: &Host, sessions: u16) -> Result<Deployment> {
+        self.servers(host)?.open(runtime, usize::from(sessions))
     }
 
     /// The servers to start or to connect to.

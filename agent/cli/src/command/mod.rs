@@ -1,6 +1,7 @@
 //! The subcommands: each file holds the arguments of one subcommand and the function that runs it.
 
 mod bench;
+mod cache;
 mod collect;
 mod completions;
 mod conformance;
@@ -10,6 +11,7 @@ mod doctor;
 mod episodes;
 mod evaluate;
 mod list;
+mod loading;
 mod names;
 mod policy;
 mod policy_server;

@@ -5,16 +5,17 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Result;
-use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::{Args, ValueEnum};
 use decision::Policy;
 use remote_policy::{Address, RemotePolicy};
-use runtime::servers::Host;
+use runtime::servers::{Host, data_folder};
 use serde::Deserialize;
 use serde_json::{Value, json};
-use vla::{CompletionParser, DeviceName, LoadOptions, ReasoningMode, Vla};
+use vla::{CompletionParser, DeviceName, LoadOptions, Loading, ReasoningMode, Vla, WeightFormat};
 
 use super::WrongUsage;
+use super::loading::LoadingProgress;
 use super::policy_server::ServerArguments;
 use crate::files::{self, VERIFIER_FILE};
 
@@ -29,6 +30,25 @@ pub struct PolicyArguments {
     pub device: DeviceName,
     #[command(flatten)]
     pub server: ServerArguments,
+    /// Bits of the decoder's weights in memory; 8bit halves memory and time per token of a large checkpoint on a CPU, and
+    /// changes some tokens
+    #[arg(long, value_enum, default_value_t, value_name = "BITS")]
+    pub weights: WeightBits,
+    /// Gigabytes for keys and values; --sessions is lowered to what fits [default: 75 % of the free memory]
+    #[arg(long, value_name = "GB", value_parser = gigabytes)]
+    pub kv_cache: Option<f64>,
+}
+
+/// The format of the decoder's weights in memory.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
+pub enum WeightBits {
+    /// As in the checkpoint
+    #[default]
+    #[value(name = "16bit")]
+    Sixteen,
+    /// Integers with one scale per output
+    #[value(name = "8bit")]
+    Eight,
 }
 
 /// Which policy, and how its files are read.
@@ -86,7 +106,7 @@ impl PolicyArguments {
         if let Some(loaded) = self.connect(host)? {
             return Ok(loaded);
         }
-        self.load_folder(self.source.folder(host)?)
+        self.load_folder(self.source.folder(host)?, host)
     }
 
     /// Connects to the policy server, if the policy is one.
@@ -112,10 +132,19 @@ impl PolicyArguments {
     }
 
     /// Loads the checkpoint in a folder that [`PolicySource`] has chosen.
-    pub fn load_folder(&self, folder: PathBuf) -> Result<LoadedPolicy> {
+    pub fn load_folder(&self, folder: PathBuf, host: &Host) -> Result<LoadedPolicy> {
         ensure_folder(&folder)?;
         let options = self.source.checkpoint.options();
-        let policy = Vla::load(&folder, self.device, &options).map_err(wrong_usage)?;
+        let progress = LoadingProgress::new(folder.display().to_string());
+        let digests = data_folder(host).map(|data| data.join("digests"));
+        let loading = Loading {
+            device: self.device,
+            weights: self.weights.format(),
+            digests: digests.as_deref(),
+            report: &|loaded| progress.report(loaded),
+        };
+        let policy = Vla::load_with(&folder, &options, &loading).map_err(wrong_usage)?;
+        progress.finish();
         let policy = Arc::new(policy);
         Ok(LoadedPolicy {
             policy: Arc::clone(&policy) as Arc<dyn Policy>,
@@ -124,6 +153,20 @@ impl PolicyArguments {
             name: folder.display().to_string(),
             folder: Some(folder),
         })
+    }
+}
+
+impl WeightBits {
+    fn format(self) -> WeightFormat {
+        match self {
+            WeightBits::Sixteen => WeightFormat::Exact,
+            WeightBits::Eight => WeightFormat::Eight,
+        }
+    }
+
+    /// The value for the header of a run; `None` for the default.
+    pub fn header(self) -> Option<Value> {
+        (self != WeightBits::default()).then(|| json!("8bit"))
     }
 }
 
@@ -227,6 +270,12 @@ impl LoadedPolicy {
 pub fn verifier_beside(folder: &Path) -> Option<PathBuf> {
     let file = folder.join(VERIFIER_FILE);
     file.is_file().then_some(file)
+}
+
+/// Parses a number of gigabytes.
+fn gigabytes(text: &str) -> Result<f64, String> {
+    let number = text.parse::<f64>().ok().filter(|number| number.is_finite() && *number > 0.0);
+    number.ok_or_else(|| format!("expected a number of gigabytes above 0, got {text}"))
 }
 
 fn ensure_folder(folder: &Path) -> Result<()> {

@@ -1,7 +1,7 @@
 //! `rever serve-policy`: the agent as a policy server for the harnesses of others.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
@@ -84,7 +84,7 @@ enum GripperName {
 
 /// Serves until Ctrl-C or SIGTERM.
 pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
-    let key = arguments.key_file.as_ref().map(read_key).transpose()?;
+    let key = arguments.key_file.as_deref().map(read_key).transpose()?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start the async runtime")?;
     // Bound first: a port that is taken is an error before a policy of 15 GB is read.
     let listen = arguments.listen;
@@ -101,6 +101,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let verifier = arguments.verifier(&loaded)?;
     let setting = arguments.setting(verifier.is_some())?;
     let clients_max = usize::from(arguments.max_clients);
+    let (seed, name) = (arguments.seed, loaded.name.clone());
     let form = ActionForm {
         rotation: match arguments.rotation {
             RotationName::Vector => Rotation::Vector,
@@ -116,7 +117,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
         policy: loaded.policy,
         scorer: verifier.map(|verifier| Arc::new(verifier) as Arc<dyn Scorer>),
         setting,
-        seed: arguments.seed,
+        seed,
         form,
         keys: ObservationKeys { camera: arguments.camera, state: arguments.state },
     };
@@ -134,7 +135,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
             stopping.send_replace(true);
         });
         if !output.is_quiet {
-            eprintln!("{}: {setting}, seed {}", loaded.name, arguments.seed);
+            eprintln!("{name}: {setting}, seed {seed}");
         }
         println!("ready ws://{address}");
         serve(listener, agent, ServerOptions { key, clients_max }, stopped).await
@@ -165,7 +166,7 @@ impl Arguments {
     }
 }
 
-fn read_key(path: &PathBuf) -> Result<ApiKey> {
+fn read_key(path: &Path) -> Result<ApiKey> {
     let read = || -> Result<ApiKey> {
         let bytes = std::fs::metadata(path)?.len();
         anyhow::ensure!(

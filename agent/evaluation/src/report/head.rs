@@ -12,7 +12,7 @@ use crate::results::{Counts, Results, StepTime};
 pub fn head(header: &RunHeader, results: &Results) -> String {
     let made = header.starts.last().map_or_else(String::new, |start| {
         format!(
-            "<span>{}</span><span>commit <code>{}</code></span><span class=\"command\"><code class=\"copy\">{}</code></span>",
+            "<span>{}</span><span>commit <code>{}</code></span><span class=\"command\"><code class=\"copy\" title=\"{2}\">{2}</code></span>",
             html(&date(&start.time)),
             html(&start.build.commit_text()),
             html(&command_line(&start.command))
@@ -32,8 +32,9 @@ fn headline(results: &Results) -> String {
     };
     let gain = gain.map_or_else(String::new, |gain| {
         let class = if gain.starts_with(['-', '−']) { " class=\"worse\"" } else { "" };
-        format!(" <b{class}>{}</b>", html(&gain))
+        format!(" <b{class}>{}</b>", html(&gain.replace('-', "−")))
     });
+    let remark = remark.replace(" -", " −");
     format!("{}{gain} <span class=\"remark\">{}</span>", html(&statement), html(&remark))
 }
 

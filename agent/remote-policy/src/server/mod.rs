@@ -28,7 +28,7 @@ pub use agent::{AgentOptions, ServedAgent};
 pub use key::ApiKey;
 pub use listen::{MESSAGE_BYTES_MAX, ServerOptions, serve};
 pub use observation::ObservationKeys;
-pub use session::Session;
+pub use resize::fit;
 
 #[cfg(test)]
 mod tests;

@@ -125,6 +125,11 @@ impl Installation {
     }
 }
 
+/// The folder for the program's own data, if the environment names one.
+pub fn data_folder(host: &Host) -> Option<PathBuf> {
+    home(&host.variables)
+}
+
 fn is_complete(folder: &Path) -> bool {
     LANDMARKS.iter().all(|file| folder.join(file).is_file())
 }

@@ -23,7 +23,7 @@ mod system_packages;
 mod variables;
 mod wheel;
 
-pub use installation::{Bundle, Host, Installation, Missing};
+pub use installation::{Bundle, Host, Installation, Missing, data_folder};
 pub use local::{LocalServerOptions, LocalServers};
 pub use native::libmujoco;
 pub use program::{ServerProgram, Simulator};

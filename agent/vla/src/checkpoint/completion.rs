@@ -7,9 +7,11 @@ use decision::{ActionSpace, Malformed, Parsed};
 
 use super::actions::ActionBins;
 use super::config::{ACTION_LENGTH, Config};
-use super::identity::identity;
+use super::digest_cache::DigestCache;
+use super::identity::Fingerprint;
 use super::options::LoadOptions;
 use super::prompt::Prompter;
+use super::shards::Shards;
 use super::{confidence, parse};
 
 /// Everything in a checkpoint's configuration and tokenizer that is needed to parse completions.
@@ -17,14 +19,23 @@ pub struct CompletionParser {
     pub(crate) config: Config,
     pub(crate) prompter: Prompter,
     pub(crate) bins: ActionBins,
-    digest: String,
+    pub(crate) digest: String,
 }
 
 impl CompletionParser {
     /// Loads config.json and tokenizer.json from a checkpoint folder and computes the checkpoint's
     /// identity.
     pub fn load(directory: &Path, options: &LoadOptions) -> Result<CompletionParser> {
-        CompletionParser::load_with(directory, options, |config| identity(directory, config))
+        CompletionParser::load_with(directory, options, |config| {
+            let fingerprint = Fingerprint::of(directory, config)?;
+            let cache = DigestCache::open(directory, None)?;
+            if let Some(digest) = cache.digest(&fingerprint) {
+                return Ok(digest);
+            }
+            let digest = fingerprint.identity(&Shards::open(directory)?, config)?;
+            cache.keep(&fingerprint, &digest);
+            Ok(digest)
+        })
     }
 
     /// Loads what reads the records of a run, which were made with a checkpoint of this digest.
@@ -37,7 +48,8 @@ impl CompletionParser {
         CompletionParser::load_with(directory, options, |_| Ok(digest.to_owned()))
     }
 
-    fn load_with(
+    /// Loads both files; `digest` has the checkpoint's identity.
+    pub(crate) fn load_with(
         directory: &Path,
         options: &LoadOptions,
         digest: impl FnOnce(&Config) -> Result<String>,

@@ -11,10 +11,8 @@ use rayon::prelude::*;
 use crate::checkpoint::actions::ActionBins;
 use crate::checkpoint::parse::{is_action, is_complete};
 use crate::generate::sampling::{Draw, Stream, draw};
+use crate::kernels::segment::GROWTH;
 use crate::network::forward::{Context, Network};
-
-/// Initial capacity of a tail, in positions; tails grow if necessary.
-const TAIL_CAPACITY: usize = 64;
 
 /// One session's prompt and how to continue it.
 pub struct Continuation<'a> {
@@ -75,7 +73,7 @@ pub fn complete(
     let mut rows = extend(&mut completions, &hidden, &decoder.logits(&hidden)?, limits)?;
     // In the first step, a row's parent is its session.
     let parents: Vec<usize> = rows.iter().map(|row| row.parent).collect();
-    let mut tail = decoder.tails(parents, TAIL_CAPACITY);
+    let mut tail = decoder.tails(parents, GROWTH);
     while !rows.is_empty() {
         let ids: Vec<u32> = rows.iter().map(|row| row.token).collect();
         let hidden = decoder.step(&ids, &prefix, &mut tail)?;

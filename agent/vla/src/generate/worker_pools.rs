@@ -39,7 +39,7 @@ impl WorkerPools {
     pub fn new(backend: Backend) -> Result<WorkerPools> {
         let count = match backend {
             Backend::Kernels => rayon::current_num_threads(),
-            Backend::Tensors => 0,
+            Backend::Tensors(_) => 0,
         };
         let one = |_| ThreadPoolBuilder::new().num_threads(1).build();
         let pools = (0..count).map(one).collect::<Result<_, _>>();

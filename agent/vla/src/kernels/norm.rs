@@ -29,7 +29,7 @@ impl LayerNorm {
                 let epsilon = self.epsilon as f32;
                 map_rows(rows, |row, output| layer_norm_row(row, weight, bias, epsilon, output))
             }
-            Backend::Tensors => {
+            Backend::Tensors(_) => {
                 let centred = rows.broadcast_sub(&rows.mean_keepdim(D::Minus1)?)?;
                 let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
                 let scaled = centred.broadcast_div(&(variance + self.epsilon)?.sqrt()?)?;
@@ -56,7 +56,7 @@ impl RmsNorm {
                 let epsilon = self.epsilon as f32;
                 map_rows(rows, |row, output| rms_norm_row(row, weight, epsilon, output))
             }
-            Backend::Tensors => {
+            Backend::Tensors(_) => {
                 let square = rows.sqr()?.mean_keepdim(D::Minus1)?;
                 let scaled = rows.broadcast_div(&(square + self.epsilon)?.sqrt()?)?;
                 scaled.broadcast_mul(&self.weight)

@@ -8,7 +8,9 @@ use crate::kernels::backend::vectorised;
 use crate::network::rotary::HeadShape;
 
 /// Positions per block of keys.
-const BLOCK: usize = 8;
+pub const BLOCK: usize = 8;
+/// A segment grows by this many positions at a time: doubling would take up to twice the memory.
+pub const GROWTH: usize = 64;
 /// Independent sums per score, to hide the latency of multiply-add.
 const CHAINS: usize = 4;
 
@@ -49,6 +51,9 @@ impl Segment {
         let parts = key.chunks_exact(size).zip(value.chunks_exact(size));
         for (head, (key, value)) in self.heads.iter_mut().zip(parts) {
             if lane == 0 {
+                if head.keys.len() == head.keys.capacity() {
+                    head.keys.reserve_exact(GROWTH * size);
+                }
                 head.keys.resize(head.keys.len() + size * BLOCK, 0.0);
             }
             let start = self.length / BLOCK * size * BLOCK;
@@ -56,10 +61,18 @@ impl Segment {
             for (dimension, &number) in key.iter().enumerate() {
                 block[dimension * BLOCK + lane] = number;
             }
+            if head.values.len() == head.values.capacity() {
+                head.values.reserve_exact(GROWTH * size);
+            }
             head.values.extend_from_slice(value);
         }
         self.length += 1;
     }
+}
+
+/// Positions of memory that a segment with capacity for [`GROWTH`] takes when it has `positions`.
+pub fn tail_positions(positions: usize) -> usize {
+    positions.next_multiple_of(GROWTH)
 }
 
 /// The first `count` positions of a segment: those that a query may attend to.

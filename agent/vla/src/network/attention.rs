@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use candle_core::{D, Result, Tensor};
+use candle_core::{D, DType, Result, Tensor};
 use rayon::prelude::*;
 
 use crate::kernels::backend::{Backend, Values};
@@ -36,7 +36,7 @@ pub struct Tail {
 enum TailForm {
     Kernels(Vec<Segment>),
     /// (rows, positions, key width); `None` before the first push.
-    Tensors(Option<(Tensor, Tensor)>),
+    Tensors(DType, Option<(Tensor, Tensor)>),
 }
 
 /// The query rows of a session.
@@ -69,9 +69,9 @@ impl Prefix {
                 };
                 PrefixForm::Kernels(sessions.par_iter().map(segment).collect())
             }
-            Backend::Tensors => {
+            Backend::Tensors(dtype) => {
                 let part = |tensor: &Tensor, rows: &Range<usize>| {
-                    tensor.narrow(0, rows.start, rows.len())?.contiguous()
+                    tensor.narrow(0, rows.start, rows.len())?.to_dtype(dtype)?.contiguous()
                 };
                 let pairs = sessions.iter().map(|rows| Ok((part(key, rows)?, part(value, rows)?)));
                 PrefixForm::Tensors(pairs.collect::<Result<_>>()?)
@@ -114,12 +114,14 @@ impl Prefix {
                     let (key, value) = &pairs[group.session];
                     let query = query.narrow(0, group.rows.start, group.rows.len())?;
                     let query = by_head(&query, self.shape.heads, self.shape.size)?;
+                    let query = query.to_dtype(key.dtype())?;
                     let (key, value) = (self.shape.repeat(key)?, self.shape.repeat(value)?);
                     let mut scores = scores(&query, &key, self.shape.size)?;
                     if causal {
                         scores = scores.broadcast_add(&causal_mask(&scores)?)?;
                     }
-                    from_heads(&softmax(&scores)?.matmul(&value)?)
+                    let weights = softmax(&scores)?.to_dtype(value.dtype())?;
+                    from_heads(&weights.matmul(&value)?)?.to_dtype(DType::F32)
                 });
                 Tensor::cat(&parts.collect::<Result<Vec<_>>>()?, 0)
             }
@@ -132,7 +134,7 @@ impl Tail {
     pub fn new(rows: usize, capacity: usize, shape: HeadShape, backend: Backend) -> Tail {
         let form = match backend {
             Backend::Kernels => TailForm::Kernels(vec![Segment::new(shape, capacity); rows]),
-            Backend::Tensors => TailForm::Tensors(None),
+            Backend::Tensors(dtype) => TailForm::Tensors(dtype, None),
         };
         Tail { form, shape }
     }
@@ -148,9 +150,10 @@ impl Tail {
                     segment.push(key, value);
                 }
             }
-            TailForm::Tensors(pair) => {
+            TailForm::Tensors(dtype, pair) => {
                 // (rows, key width) -> (rows, 1, key width)
-                let (key, value) = (key.unsqueeze(1)?, value.unsqueeze(1)?);
+                let new = |tensor: &Tensor| tensor.to_dtype(*dtype)?.unsqueeze(1);
+                let (key, value) = (new(key)?, new(value)?);
                 *pair = Some(match pair.take() {
                     None => (key, value),
                     Some((keys, values)) => {
@@ -178,12 +181,12 @@ impl Tail {
                 };
                 *segments = parents.iter().map(child).collect();
             }
-            TailForm::Tensors(Some((keys, values))) => {
+            TailForm::Tensors(_, Some((keys, values))) => {
                 let rows: Vec<u32> = parents.iter().map(|&parent| parent as u32).collect();
                 let rows = Tensor::new(rows, keys.device())?;
                 (*keys, *values) = (keys.index_select(&rows, 0)?, values.index_select(&rows, 0)?);
             }
-            TailForm::Tensors(None) => {}
+            TailForm::Tensors(_, None) => {}
         }
         Ok(())
     }
@@ -199,7 +202,7 @@ impl Tail {
                 };
                 attend_slices(query, self.shape, seen)
             }
-            (TailForm::Tensors(Some(tails)), PrefixForm::Tensors(prefixes)) => {
+            (TailForm::Tensors(_, Some(tails)), PrefixForm::Tensors(prefixes)) => {
                 let parts = groups.iter().map(|group| {
                     attend_tensors(query, tails, &prefixes[group.session], group, self.shape)
                 });
@@ -244,6 +247,7 @@ fn attend_tensors(
 ) -> Result<Tensor> {
     let (start, rows) = (group.rows.start, group.rows.len());
     let query = by_head(&query.narrow(0, start, rows)?, shape.heads, shape.size)?;
+    let query = query.to_dtype(key.dtype())?;
     let prefix_length = key.dim(0)?;
     let (key, value) = (shape.repeat(key)?, shape.repeat(value)?);
     let tail = |tensor: &Tensor| {
@@ -258,12 +262,14 @@ fn attend_tensors(
     // (heads, rows, size) -> (heads, rows, 1, size) x (heads, rows, size, positions)
     let own = query.unsqueeze(2)?.contiguous()?;
     let own = own.matmul(&tail_key.transpose(2, 3)?.contiguous()?)?.squeeze(2)?;
-    let own = (own / (shape.size as f64).sqrt())?;
+    let own = (own.to_dtype(DType::F32)? / (shape.size as f64).sqrt())?;
     let weights = softmax(&Tensor::cat(&[scores(&query, &key, shape.size)?, own], 2)?)?;
+    let weights = weights.to_dtype(value.dtype())?;
     let shared = weights.narrow(2, 0, prefix_length)?.contiguous()?.matmul(&value)?;
     let positions = tail_value.dim(2)?;
     let own = weights.narrow(2, prefix_length, positions)?.unsqueeze(2)?.contiguous()?;
-    from_heads(&(shared + own.matmul(&tail_value)?.squeeze(2)?)?)
+    let own = own.matmul(&tail_value)?.squeeze(2)?.to_dtype(DType::F32)?;
+    from_heads(&(shared.to_dtype(DType::F32)? + own)?)
 }
 
 impl HeadShape {
@@ -291,7 +297,8 @@ fn from_heads(x: &Tensor) -> Result<Tensor> {
 
 /// (heads, rows, size) x (heads, positions, size) -> (heads, rows, positions)
 fn scores(query: &Tensor, key: &Tensor, size: usize) -> Result<Tensor> {
-    query.matmul(&key.transpose(1, 2)?.contiguous()?)? / (size as f64).sqrt()
+    let products = query.matmul(&key.transpose(1, 2)?.contiguous()?)?.to_dtype(DType::F32)?;
+    products / (size as f64).sqrt()
 }
 
 fn softmax(scores: &Tensor) -> Result<Tensor> {

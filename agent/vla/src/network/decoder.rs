@@ -7,13 +7,15 @@
 use std::ops::Range;
 
 use anyhow::{Result, ensure};
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 
 use crate::checkpoint::config::TextConfig;
-use crate::checkpoint::weights::Part;
+use crate::checkpoint::weights::{Part, in_order};
 use crate::kernels::activation::gated_silu;
-use crate::kernels::backend::Backend;
+use crate::kernels::backend::{Backend, Values};
+use crate::kernels::matmul;
 use crate::kernels::norm::RmsNorm;
+use crate::kernels::segment::{BLOCK, tail_positions};
 use crate::network::attention::{Group, Prefix};
 use crate::network::cache::{PrefixCache, TailCache};
 use crate::network::linear::Linear;
@@ -54,26 +56,31 @@ pub enum Wanted {
 
 impl Decoder {
     /// Loads the weights under `language_model`.
-    pub fn load(mut weights: Part<'_>, config: &TextConfig) -> Result<Decoder> {
+    pub fn load(mut weights: Part<'_, '_>, config: &TextConfig) -> Result<Decoder> {
         let (hidden, vocabulary) = (config.hidden_size, config.vocab_size);
-        let (backend, device) = (weights.backend(), weights.device());
-        let mut layers = Vec::new();
-        for index in 0..config.num_hidden_layers {
-            layers.push(Layer::load(weights.part(&format!("model.layers.{index}")), config)?);
-        }
+        let target = weights.target();
+        let (backend, device) = (target.backend, target.device.clone());
+        // Tensors are taken in the order of their names, which is the order of the digest: they are
+        // then read once.
+        let lm_head = weights.take_to_host("lm_head.weight", &[vocabulary, hidden])?;
+        let lm_head = Linear::new(&lm_head, None, &target)?;
+        let embedding = weights.take_to_host("model.embed_tokens.weight", &[vocabulary, hidden])?;
+        let embed_tokens = embedding_table(embedding, backend)?.to_device(&device)?;
+        let layers = in_order(config.num_hidden_layers, |index| {
+            Layer::load(weights.part(&format!("model.layers.{index}")), config)
+        })?;
         let norm = RmsNorm {
             weight: weights.take("model.norm.weight", &[hidden])?,
             epsilon: config.rms_norm_eps,
             backend,
         };
-        let lm_head = weights.take("lm_head.weight", &[vocabulary, hidden])?;
         let shape = config.head_shape();
         let positions_max = config.max_position_embeddings;
         Ok(Decoder {
-            embed_tokens: weights.take("model.embed_tokens.weight", &[vocabulary, hidden])?,
+            embed_tokens,
             layers,
             norm,
-            lm_head: Linear::new(&lm_head, None, backend)?,
+            lm_head,
             rotary: Rotary::new(shape.size, positions_max, config.rope_theta, backend, &device)?,
             shape,
             positions_max,
@@ -100,10 +107,21 @@ impl Decoder {
         self.layers.iter().map(layer).sum::<usize>() + self.lm_head.bytes()
     }
 
+    /// Bytes of keys and values of a session: a prefix, and a tail for each candidate.
+    pub fn cache_bytes(&self, prefix: usize, candidates: usize, tail: usize) -> usize {
+        let positions = prefix.next_multiple_of(BLOCK) + candidates * tail_positions(tail);
+        let width = match self.backend {
+            Backend::Kernels => DType::F32,
+            Backend::Tensors(dtype) => dtype,
+        }
+        .size_in_bytes();
+        2 * self.layers.len() * self.shape.key_width() * width * positions
+    }
+
     /// Token ids -> (ids, hidden)
     pub fn embed(&self, ids: &[u32]) -> Result<Tensor> {
         let ids = Tensor::new(ids, &self.device)?;
-        Ok(self.embed_tokens.index_select(&ids, 0)?)
+        Ok(self.embed_tokens.index_select(&ids, 0)?.to_dtype(DType::F32)?)
     }
 
     /// Computes whole sequences, whose embeddings are concatenated in `rows`.
@@ -178,42 +196,55 @@ impl Decoder {
     }
 }
 
+/// The table in 16 bits where these are exact, or in the type of a device's matrices.
+fn embedding_table(table: Tensor, backend: Backend) -> Result<Tensor> {
+    let dtype = match backend {
+        Backend::Kernels if matmul::is_exact_in_half(&Values::of(&table)?) => DType::BF16,
+        Backend::Kernels => DType::F32,
+        Backend::Tensors(dtype) => dtype,
+    };
+    Ok(table.to_dtype(dtype)?)
+}
+
 fn groups_of(sessions: &[Range<usize>]) -> Vec<Group> {
     let sessions = sessions.iter().cloned().enumerate();
     sessions.map(|(session, rows)| Group { session, rows }).collect()
 }
 
 impl Layer {
-    fn load(mut weights: Part<'_>, config: &TextConfig) -> Result<Layer> {
+    fn load(mut weights: Part<'_, '_>, config: &TextConfig) -> Result<Layer> {
         let (hidden, width) = (config.hidden_size, config.intermediate_size);
         let shape = config.head_shape();
         let (query_width, key_width) = (shape.query_width(), shape.key_width());
-        let backend = weights.backend();
-        let mut norm = |name: &str| -> Result<RmsNorm> {
+        let target = weights.target();
+        let backend = target.backend;
+        let norm = |weights: &mut Part<'_, '_>, name: &str| -> Result<RmsNorm> {
             let weight = weights.take(&format!("{name}.weight"), &[hidden])?;
             Ok(RmsNorm { weight, epsilon: config.rms_norm_eps, backend })
         };
-        let input_layernorm = norm("input_layernorm")?;
-        let post_attention_layernorm = norm("post_attention_layernorm")?;
-        let mut weight = |name: &str, outputs: usize, inputs: usize| {
-            weights.take(&format!("{name}.weight"), &[outputs, inputs])
+        let weight = |weights: &mut Part<'_, '_>, name: &str, outputs: usize, inputs: usize| {
+            weights.take_to_host(&format!("{name}.weight"), &[outputs, inputs])
         };
-        let query_key_value = [
-            weight("self_attn.q_proj", query_width, hidden)?,
-            weight("self_attn.k_proj", key_width, hidden)?,
-            weight("self_attn.v_proj", key_width, hidden)?,
-        ];
-        let gate_up =
-            [weight("mlp.gate_proj", width, hidden)?, weight("mlp.up_proj", width, hidden)?];
-        let o_proj = weight("self_attn.o_proj", hidden, query_width)?;
-        let down_proj = weight("mlp.down_proj", hidden, width)?;
+        let linear = |weight: &Tensor| Linear::new(weight, None, &target);
+        // In the order of names.
+        let input_layernorm = norm(&mut weights, "input_layernorm")?;
+        let down_proj = linear(&weight(&mut weights, "mlp.down_proj", hidden, width)?)?;
+        let gate = weight(&mut weights, "mlp.gate_proj", width, hidden)?;
+        let up = weight(&mut weights, "mlp.up_proj", width, hidden)?;
+        let gate_up = linear(&Tensor::cat(&[gate, up], 0)?)?;
+        let post_attention_layernorm = norm(&mut weights, "post_attention_layernorm")?;
+        let key = weight(&mut weights, "self_attn.k_proj", key_width, hidden)?;
+        let o_proj = linear(&weight(&mut weights, "self_attn.o_proj", hidden, query_width)?)?;
+        let query = weight(&mut weights, "self_attn.q_proj", query_width, hidden)?;
+        let value = weight(&mut weights, "self_attn.v_proj", key_width, hidden)?;
+        let query_key_value = linear(&Tensor::cat(&[query, key, value], 0)?)?;
         Ok(Layer {
             input_layernorm,
-            query_key_value: Linear::new(&Tensor::cat(&query_key_value, 0)?, None, backend)?,
-            o_proj: Linear::new(&o_proj, None, backend)?,
+            query_key_value,
+            o_proj,
             post_attention_layernorm,
-            gate_up: Linear::new(&Tensor::cat(&gate_up, 0)?, None, backend)?,
-            down_proj: Linear::new(&down_proj, None, backend)?,
+            gate_up,
+            down_proj,
             backend,
         })
     }

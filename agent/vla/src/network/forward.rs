@@ -1,16 +1,14 @@
 //! The whole network: from image and prompt ids to hidden states and logits.
 
 use std::ops::Range;
-use std::path::Path;
 
 use anyhow::Result;
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use protocol::message::Image;
 use rayon::prelude::*;
 
 use crate::checkpoint::config::Config;
-use crate::checkpoint::weights::{Weights, weight_files};
-use crate::kernels::backend::Backend;
+use crate::checkpoint::weights::{Rest, Weights};
 use crate::network::cache::PrefixCache;
 use crate::network::decoder::{Decoder, Wanted};
 use crate::network::projector::Projector;
@@ -25,8 +23,6 @@ pub struct Network {
     vision_backbone: VisionBackbone,
     projector: Projector,
     pub decoder: Decoder,
-    /// Number of weights in the file that affect no output.
-    pub dead_weights: usize,
 }
 
 /// The input of a session: the first id, the image, the other ids.
@@ -37,25 +33,20 @@ pub struct Context<'a> {
 }
 
 impl Network {
-    /// Loads the weights from a checkpoint folder.
-    pub fn load(
-        directory: &Path,
-        config: &Config,
-        device: &Device,
-        backend: Backend,
-    ) -> Result<Network> {
-        let mut weights = Weights::load(&weight_files(directory)?, device, backend)?;
+    /// Makes the layers of their tensors.
+    pub fn load(mut weights: Weights<'_>, config: &Config) -> Result<(Network, Rest)> {
         let width = config.towers.iter().map(|tower| tower.embed_dim).sum();
         let (hidden, fused) = (config.text.hidden_size, config.towers.len() == 2);
+        // In the order of names, as within each of them.
+        let decoder = Decoder::load(weights.part("language_model"), &config.text)?;
+        let projector = Projector::load(weights.part("projector"), width, hidden, fused)?;
         let vision_backbone =
             VisionBackbone::load(weights.part("vision_backbone"), &config.towers)?;
-        let projector = Projector::load(weights.part("projector"), width, hidden, fused)?;
-        let decoder = Decoder::load(weights.part("language_model"), &config.text)?;
         let towers = VisionBackbone::blocks_used(&config.towers);
         let towers: Vec<(&str, usize)> =
             towers.iter().map(|(name, blocks)| (name.as_str(), *blocks)).collect();
-        let dead_weights = weights.finish(&towers)?;
-        Ok(Network { vision_backbone, projector, decoder, dead_weights })
+        let rest = weights.finish(&towers)?;
+        Ok((Network { vision_backbone, projector, decoder }, rest))
     }
 
     /// Computes images and prompts of all sessions in parallel; returns the last hidden states

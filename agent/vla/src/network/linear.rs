@@ -1,7 +1,8 @@
 //! A linear layer: rows (n, inputs) -> rows (n, outputs), with an optional bias.
 
-use candle_core::{Result, Tensor};
+use candle_core::{DType, Result, Tensor};
 
+use crate::checkpoint::weights::Target;
 use crate::kernels::backend::{Backend, Values};
 use crate::kernels::matmul::PackedWeight;
 
@@ -17,15 +18,19 @@ enum Form {
 }
 
 impl Linear {
-    /// Makes a layer from a weight of (outputs, inputs), the layout of checkpoints.
-    pub fn new(weight: &Tensor, bias: Option<Tensor>, backend: Backend) -> Result<Linear> {
+    /// Makes a layer from a weight of (outputs, inputs), the layout of checkpoints, in the memory of
+    /// the CPU.
+    pub fn new(weight: &Tensor, bias: Option<Tensor>, target: &Target) -> Result<Linear> {
         let weight = weight.contiguous()?;
-        let form = match backend {
+        let form = match target.backend {
             Backend::Kernels => {
                 let (outputs, inputs) = weight.dims2()?;
-                Form::Packed(PackedWeight::pack(&Values::of(&weight)?, outputs, inputs))
+                let values = Values::of(&weight)?;
+                Form::Packed(PackedWeight::pack(&values, outputs, inputs, target.format))
             }
-            Backend::Tensors => Form::Tensor(weight),
+            Backend::Tensors(dtype) => {
+                Form::Tensor(weight.to_dtype(dtype)?.to_device(&target.device)?)
+            }
         };
         Ok(Linear { form, bias })
     }
@@ -59,7 +64,8 @@ impl Linear {
                 Tensor::from_vec(output, (count, weight.outputs()), rows.device())
             }
             Form::Tensor(weight) => {
-                let mut output = rows.matmul(&weight.t()?)?;
+                let rows = rows.to_dtype(weight.dtype())?;
+                let mut output = rows.matmul(&weight.t()?)?.to_dtype(DType::F32)?;
                 if let Some(bias) = &self.bias {
                     output = output.broadcast_add(bias)?;
                 }

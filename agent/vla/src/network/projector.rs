@@ -18,7 +18,7 @@ pub struct Projector {
 impl Projector {
     /// Loads the layers. With fused towers the first layer is four times as wide as the features.
     pub fn load(
-        mut weights: Part<'_>,
+        mut weights: Part<'_, '_>,
         vision_width: usize,
         hidden: usize,
         fused: bool,
@@ -28,15 +28,15 @@ impl Projector {
         } else {
             vec![vision_width, hidden, hidden]
         };
-        let backend = weights.backend();
+        let target = weights.target().exact();
         let mut layers = Vec::new();
         for (index, pair) in widths.windows(2).enumerate() {
             let mut part = weights.part(&format!("fc{}", index + 1));
-            let weight = part.take("weight", &[pair[1], pair[0]])?;
+            let weight = part.take_to_host("weight", &[pair[1], pair[0]])?;
             let bias = part.take("bias", &[pair[1]])?;
-            layers.push(Linear::new(&weight, Some(bias), backend)?);
+            layers.push(Linear::new(&weight, Some(bias), &target)?);
         }
-        Ok(Projector { layers, backend })
+        Ok(Projector { layers, backend: target.backend })
     }
 
     /// (patches, vision width) -> (patches, hidden)

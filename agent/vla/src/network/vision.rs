@@ -9,7 +9,7 @@ use anyhow::Result;
 use candle_core::{Device, Tensor};
 
 use crate::checkpoint::config::TowerConfig;
-use crate::checkpoint::weights::Part;
+use crate::checkpoint::weights::{Part, Target, in_order};
 use crate::kernels::activation::gelu;
 use crate::kernels::backend::Backend;
 use crate::kernels::norm::LayerNorm;
@@ -59,7 +59,7 @@ struct Block {
 
 impl VisionBackbone {
     /// Loads the towers' weights; with two towers, the first one is DINO-like.
-    pub fn load(mut weights: Part<'_>, configs: &[TowerConfig]) -> Result<VisionBackbone> {
+    pub fn load(mut weights: Part<'_, '_>, configs: &[TowerConfig]) -> Result<VisionBackbone> {
         let mut towers = Vec::new();
         for (index, config) in configs.iter().enumerate() {
             let name = TOWER_NAMES[index];
@@ -94,32 +94,31 @@ fn normalisation(configs: &[TowerConfig], index: usize) -> Normalisation {
 
 impl Tower {
     fn load(
-        mut weights: Part<'_>,
+        mut weights: Part<'_, '_>,
         config: &TowerConfig,
         name: &'static str,
         normalisation: Normalisation,
     ) -> Result<Tower> {
         let (width, patch) = (config.embed_dim, config.patch_size);
         let patches = config.side() * config.side();
-        let device = weights.device();
-        let backend = weights.backend();
-        let kernel = weights.take("patch_embed.proj.weight", &[width, 3, patch, patch])?;
-        let bias = weights.take("patch_embed.proj.bias", &[width])?;
-        let patch_embed = Linear::new(&kernel.flatten_from(1)?, Some(bias), backend)?;
-        let pos_embed = weights.take("pos_embed", &[1, patches, width])?.squeeze(0)?;
+        let target = weights.target().exact();
+        // In the order of names, as in the decoder.
+        let blocks = in_order(config.depth - 1, |index| {
+            Block::load(weights.part(&format!("blocks.{index}")), config)
+        })?;
         let mut prefix = Vec::new();
         if config.class_token {
             prefix.push(weights.take("cls_token", &[1, 1, width])?.squeeze(0)?);
         }
+        let bias = weights.take("patch_embed.proj.bias", &[width])?;
+        let kernel = weights.take_to_host("patch_embed.proj.weight", &[width, 3, patch, patch])?;
+        let patch_embed = Linear::new(&kernel.flatten_from(1)?, Some(bias), &target)?;
+        let pos_embed = weights.take("pos_embed", &[1, patches, width])?.squeeze(0)?;
         if config.registers > 0 {
             prefix.push(weights.take("reg_token", &[1, config.registers, width])?.squeeze(0)?);
         }
         let prefix = if prefix.is_empty() { None } else { Some(Tensor::cat(&prefix, 0)?) };
-        let mut blocks = Vec::new();
-        for index in 0..config.depth - 1 {
-            blocks.push(Block::load(weights.part(&format!("blocks.{index}")), config)?);
-        }
-        let config = config.clone();
+        let (config, device) = (config.clone(), target.device);
         Ok(Tower { config, name, normalisation, patch_embed, pos_embed, prefix, blocks, device })
     }
 
@@ -156,34 +155,32 @@ impl Tower {
 }
 
 impl Block {
-    fn load(mut weights: Part<'_>, config: &TowerConfig) -> Result<Block> {
+    fn load(mut weights: Part<'_, '_>, config: &TowerConfig) -> Result<Block> {
         let (width, hidden) = (config.embed_dim, config.mlp_width());
-        let backend = weights.backend();
-        let mut norm = |name: &str| -> Result<LayerNorm> {
-            let weight = weights.take(&format!("{name}.weight"), &[width])?;
-            let bias = weights.take(&format!("{name}.bias"), &[width])?;
-            Ok(LayerNorm { weight, bias, epsilon: LAYER_NORM_EPSILON, backend })
-        };
-        let (norm1, norm2) = (norm("norm1")?, norm("norm2")?);
-        let joined = weights.take("attn.qkv.weight", &[3 * width, width])?;
+        let target = weights.target().exact();
+        let backend = target.backend;
+        // In the order of names, as in the decoder.
+        let proj = linear(&mut weights, "attn.proj", width, width, &target)?;
         let joined_bias = weights.take("attn.qkv.bias", &[3 * width])?;
+        let joined = weights.take_to_host("attn.qkv.weight", &[3 * width, width])?;
         let third = |index: usize| {
             let bias = joined_bias.narrow(0, index * width, width)?.contiguous()?;
-            Linear::new(&joined.narrow(0, index * width, width)?, Some(bias), backend)
+            Linear::new(&joined.narrow(0, index * width, width)?, Some(bias), &target)
         };
-        let mut linear = |name: &str, outputs: usize, inputs: usize| -> Result<Linear> {
-            let weight = weights.take(&format!("{name}.weight"), &[outputs, inputs])?;
-            let bias = weights.take(&format!("{name}.bias"), &[outputs])?;
-            Ok(Linear::new(&weight, Some(bias), backend)?)
-        };
-        let proj = linear("attn.proj", width, width)?;
-        let (fc1, fc2) = (linear("mlp.fc1", hidden, width)?, linear("mlp.fc2", width, hidden)?);
+        let (query, key, value) = (third(0)?, third(1)?, third(2)?);
         let mut layer_scale = |name: &str| -> Result<Option<Tensor>> {
             let name = format!("{name}.scale_factor");
             config.layer_scale.then(|| weights.take(&name, &[width])).transpose()
         };
         let (ls1, ls2) = (layer_scale("ls1")?, layer_scale("ls2")?);
-        let (query, key, value) = (third(0)?, third(1)?, third(2)?);
+        let fc1 = linear(&mut weights, "mlp.fc1", hidden, width, &target)?;
+        let fc2 = linear(&mut weights, "mlp.fc2", width, hidden, &target)?;
+        let mut norm = |name: &str| -> Result<LayerNorm> {
+            let bias = weights.take(&format!("{name}.bias"), &[width])?;
+            let weight = weights.take(&format!("{name}.weight"), &[width])?;
+            Ok(LayerNorm { weight, bias, epsilon: LAYER_NORM_EPSILON, backend })
+        };
+        let (norm1, norm2) = (norm("norm1")?, norm("norm2")?);
         let shape = config.head_shape();
         Ok(Block { norm1, query, key, value, proj, ls1, norm2, fc1, fc2, ls2, shape, backend })
     }
@@ -203,6 +200,18 @@ impl Block {
         let hidden = self.fc1.forward(&self.norm2.forward(&rows)?)?;
         onto(&rows, &self.fc2, &gelu(&hidden, self.backend)?, self.ls2.as_ref())
     }
+}
+
+fn linear(
+    weights: &mut Part<'_, '_>,
+    name: &str,
+    outputs: usize,
+    inputs: usize,
+    target: &Target,
+) -> Result<Linear> {
+    let bias = weights.take(&format!("{name}.bias"), &[outputs])?;
+    let weight = weights.take_to_host(&format!("{name}.weight"), &[outputs, inputs])?;
+    Ok(Linear::new(&weight, Some(bias), target)?)
 }
 
 /// rows + layer scale x linear(input).

@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod families;
+mod loading;
 mod options;
 mod parity;
 mod proposal;
@@ -13,7 +14,8 @@ use candle_core::{DType, Device, Tensor};
 
 use decision::{Image, Policy as _};
 
-use super::{Backend, DeviceName, LoadOptions, Vla};
+use super::{Backend, DeviceName, LoadOptions, Loading, Vla, WeightFormat};
+use crate::checkpoint::weights::Target;
 
 /// Both tiny layouts: one tower as in the shipped model, two as in OpenVLA-7B.
 const TINY: [&str; 2] = ["tiny", "tiny-fused"];

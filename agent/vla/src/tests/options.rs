@@ -37,7 +37,8 @@ fn vicuna(datasets: &[&str]) -> Value {
 }
 
 fn statistics(scale: f64) -> Value {
-    json!({"action": {"q01": [-scale; 7], "q99": [scale; 7], "mask": [true, true, true, true, true, true, false]}})
+    let (low, high) = ([-scale; 7], [scale; 7]);
+    json!({"action": {"q01": low, "q99": high, "mask": [true, true, true, true, true, true, false]}})
 }
 
 /// The configuration of a folder with this config.json and other files.
@@ -106,7 +107,7 @@ fn a_missing_mask_is_all_true_and_an_unused_dataset_spoils_nothing() -> Result<(
     let mut config = openvla();
     let mask = config["norm_stats"]["bridge_orig"]["action"].as_object_mut();
     mask.expect("statistics").remove("mask");
-    config["norm_stats"]["kuka"]["action"]["q01"] = json!([0.0; 14]);
+    config["norm_stats"]["kuka"]["action"]["q01"] = vec![0.0; 14].into();
     config["norm_stats"]["droid"] = json!("none");
     assert_eq!(read(&config, &[], &key("bridge_orig"))?.action_scale.mask, [true; 7]);
     let refused = reason(read(&config, &[], &key("kuka")));

@@ -14,7 +14,7 @@ const TOLERANCE: f32 = 1e-4;
 #[test]
 fn every_layer_equals_pytorch() -> Result<()> {
     for name in TINY {
-        for backend in [Backend::Kernels, Backend::Tensors] {
+        for backend in [Backend::Kernels, Backend::Tensors(DType::F32)] {
             let policy = tiny(name, backend)?;
             let golden = Golden::load(&fixtures().join(name).join("activations.safetensors"))?;
             let ids = [golden.ids("prompt")?, golden.ids("forced")?].concat();
@@ -38,7 +38,7 @@ fn every_layer_equals_pytorch() -> Result<()> {
 #[test]
 fn greedy_tokens_equal_pytorch() -> Result<()> {
     for name in TINY {
-        for backend in [Backend::Kernels, Backend::Tensors] {
+        for backend in [Backend::Kernels, Backend::Tensors(DType::F32)] {
             let policy = tiny(name, backend)?;
             let golden = Golden::load(&fixtures().join(name).join("activations.safetensors"))?;
             let (image, prompt) = (golden.image("image")?, golden.ids("prompt")?);
@@ -53,7 +53,7 @@ fn greedy_tokens_equal_pytorch() -> Result<()> {
 #[test]
 fn steps_onto_a_shared_prefix_equal_the_whole_sequence() -> Result<()> {
     for name in TINY {
-        for backend in [Backend::Kernels, Backend::Tensors] {
+        for backend in [Backend::Kernels, Backend::Tensors(DType::F32)] {
             let policy = tiny(name, backend)?;
             let golden = Golden::load(&fixtures().join(name).join("activations.safetensors"))?;
             let image = golden.image("image")?;

@@ -8,6 +8,7 @@ use decision::{Policy, Setting};
 use runtime::servers::Host;
 use serde_json::Value;
 use verifier::Verifier;
+use vla::Vla;
 
 use super::{EpisodesArguments, Request};
 use crate::command::policy::{LoadedPolicy, verifier_beside};
@@ -18,6 +19,8 @@ use crate::files::VERIFIER_FILE;
 pub struct Ready {
     /// Proposes candidates.
     pub policy: Arc<dyn Policy>,
+    /// The same policy, if it is a local checkpoint.
+    pub checkpoint: Option<Arc<Vla>>,
     /// The settings that can be run.
     pub settings: Vec<Setting>,
     /// Scores candidates.
@@ -50,16 +53,16 @@ impl EpisodesArguments {
         }
         let wrong_usage = |error: anyhow::Error| WrongUsage(format!("{error:#}"));
         file.as_deref().map(Verifier::load_any).transpose().map_err(wrong_usage)?;
-        let LoadedPolicy { policy, .. } = match (remote, folder) {
+        let LoadedPolicy { policy, checkpoint, .. } = match (remote, folder) {
             (Some(loaded), _) => loaded,
-            (None, Some(folder)) => self.policy.load_folder(folder)?,
+            (None, Some(folder)) => self.policy.load_folder(folder, host)?,
             (None, None) => bail!("expected a folder or a policy server"),
         };
         let digest = &policy.info().digest;
         let verifier = file.map(|file| Verifier::load(&file, digest).map(Arc::new)).transpose();
         let verifier = verifier.map_err(wrong_usage)?;
         let server = server.as_deref().map(policy_server::header).transpose()?;
-        Ok(Ready { policy, settings, verifier, server })
+        Ok(Ready { policy, checkpoint, settings, verifier, server })
     }
 
     /// The file of `--verifier`, or else the one beside the policy's weights unless a published one is followed.

@@ -95,7 +95,6 @@ impl Echo {
 /// A server, stopped when this is dropped.
 pub struct Server {
     pub address: SocketAddr,
-    pub agent: Arc<ServedAgent>,
     stop: watch::Sender<bool>,
 }
 
@@ -122,8 +121,8 @@ impl Server {
         let (stop, stopped) = watch::channel(false);
         let key = key.map(|key| ApiKey::new(key).expect("a key"));
         let options = ServerOptions { key, clients_max };
-        tokio::spawn(serve(listener, Arc::clone(&agent), options, stopped));
-        Server { address, agent, stop }
+        tokio::spawn(serve(listener, agent, options, stopped));
+        Server { address, stop }
     }
 
     pub async fn connect(&self) -> Client {
