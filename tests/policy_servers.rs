@@ -107,8 +107,8 @@ fn a_chunk_is_the_same_whether_client_or_server_keeps_it() {
     let profile = folder.path().join("chunks.toml");
     let shipped = repository().join("agent/remote-policy/profiles/simpler.toml");
     let shipped = std::fs::read_to_string(shipped).expect("a profile");
-    let text = shipped.replace("execute = 1", "execute = 3").replace("= 224", "= 64");
-    std::fs::write(&profile, text).expect("a file");
+    let chunks = shipped.replace("execute = 1", "execute = 3").replace("= 224", "= 64");
+    std::fs::write(&profile, chunks).expect("a file");
     let profile = format!("--policy-profile={}", profile.display());
     let episodes = |wire: &str| {
         let server = Server::of_peer(wire);
