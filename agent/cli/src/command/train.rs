@@ -137,7 +137,8 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         };
         write_whole(json, &serde_json::to_vec_pretty(&result)?)?;
     }
-    println!("next: rever evaluate --strategies sample,verifier --verifier {out}");
+    let policy = arguments.policy.words();
+    println!("next: rever evaluate{policy} --strategies sample,verifier --verifier {out}");
     match &arguments.name {
         Some(name) => publish(&arguments, name, &verifier),
         None => Ok(()),
