@@ -9,6 +9,7 @@ from pathlib import Path
 import json_numpy
 import numpy as np
 from openpi_client import msgpack_numpy
+from vla_eval.protocol.image_codec import encode_image
 from vla_eval.protocol.messages import Message, MessageType, pack_message
 from vla_eval.protocol.numpy_codec import set_image_format
 
@@ -65,9 +66,11 @@ def vla_eval() -> dict[str, bytes]:
         ),
         "episode_end": pack(MessageType.EPISODE_END, {"metrics": {"success": True}}, 4),
     }
-    for form in ["png", "jpeg", "raw"]:
+    for form, name in [("png", "png"), ("jpeg", "jpeg"), ("raw", "array")]:
         set_image_format(form)
-        frames[f"observation_{form}"] = pack(MessageType.OBSERVATION, observation, 3)
+        frames[f"observation_{name}"] = pack(MessageType.OBSERVATION, observation, 3)
+    raw = {**observation, "images": {"primary": encode_image(PIXELS, "raw")}}
+    frames["observation_raw"] = pack(MessageType.OBSERVATION, raw, 3)
     return {f"vla_eval_{name}": frame for name, frame in frames.items()}
 
 

@@ -32,6 +32,7 @@ impl Vla {
             candidates: 1,
             temperature: 0.0,
             seed: 0,
+            episode: None,
         };
         let candidate =
             self.propose_now(&[request])?.pop().and_then(|mut all| all.candidates.pop());

@@ -150,7 +150,8 @@ impl Default for EpisodesArguments {
 impl EpisodesArguments {
     /// Runs the episodes that are not recorded yet, then computes the results of all recorded ones.
     pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
-        let Ready { policy, checkpoint, settings, verifier, server } = self.ready(&request, host)?;
+        let Ready { policy, checkpoint, settings, verifier, server } =
+            self.ready(&request, host)?;
         let sessions = self.sessions_that_fit(checkpoint.as_deref(), &settings)?;
         let digest = policy.info().digest.clone();
         // Opened now, so that a label store that cannot be used fails before any episode runs.

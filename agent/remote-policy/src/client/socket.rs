@@ -9,7 +9,7 @@ use tokio::net::TcpStream;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-use tokio_tungstenite::tungstenite::error::Error as SocketError;
+use tokio_tungstenite::tungstenite::error::{Error as SocketError, ProtocolError};
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Bytes, Message, http};
 use tokio_tungstenite::{WebSocketStream, client_async_with_config};
@@ -188,7 +188,9 @@ fn lost(error: &SocketError) -> anyhow::Error {
         SocketError::Capacity(_) => {
             anyhow!("the server sent a frame of more than {FRAME_BYTES_MAX} bytes")
         }
-        SocketError::ConnectionClosed | SocketError::AlreadyClosed => {
+        SocketError::ConnectionClosed
+        | SocketError::AlreadyClosed
+        | SocketError::Protocol(ProtocolError::ResetWithoutClosingHandshake) => {
             anyhow!("the server closed the connection")
         }
         other => anyhow!("the connection was lost: {}", printable(&other.to_string())),

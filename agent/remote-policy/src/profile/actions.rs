@@ -25,7 +25,8 @@ impl Actions {
         let mut action = received[..expected].to_vec();
         if let Some(range) = &self.normalised {
             for (number, (low, high)) in action.iter_mut().zip(range.low.iter().zip(&range.high)) {
-                *number = low + (*number + 1.0) / 2.0 * (high - low);
+                let [value, low, high] = [*number, *low, *high].map(f64::from);
+                *number = (low + (value + 1.0) / 2.0 * (high - low)) as f32;
             }
         }
         if self.rotation == Rotation::Euler {

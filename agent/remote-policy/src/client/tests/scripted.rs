@@ -17,12 +17,15 @@ use crate::codec::{Array, KeyForm, Value, actions_array, encode, openpi};
 /// What a server does with a frame: `None` closes the connection.
 pub type Script = Arc<dyn Fn(usize, &[u8]) -> Option<Vec<Message>> + Send + Sync>;
 
+/// Binary frames with the numbers of their connections.
+pub type Received = Arc<Mutex<Vec<(usize, Vec<u8>)>>>;
+
 /// A running server; dropping it closes its port and its connections.
 pub struct Scripted {
     /// Where it listens.
     pub place: SocketAddr,
     /// All binary frames that it received, with the number of their connection.
-    pub received: Arc<Mutex<Vec<(usize, Vec<u8>)>>>,
+    pub received: Received,
     _runtime: Runtime,
 }
 
@@ -36,7 +39,7 @@ impl Scripted {
             .expect("a runtime");
         let listener = runtime.block_on(TcpListener::bind(("127.0.0.1", port))).expect("a port");
         let place = listener.local_addr().expect("an address");
-        let received = Arc::new(Mutex::new(Vec::new()));
+        let received = Received::default();
         let kept = Arc::clone(&received);
         runtime.spawn(async move {
             let connections = AtomicUsize::new(0);
@@ -53,12 +56,6 @@ impl Scripted {
         });
         Scripted { place, received, _runtime: runtime }
     }
-
-    /// Number of connections that sent a frame.
-    pub fn connections(&self) -> usize {
-        let received = self.received.lock().expect("not poisoned");
-        received.iter().map(|(index, _)| index + 1).max().unwrap_or(0)
-    }
 }
 
 async fn answer(
@@ -66,7 +63,7 @@ async fn answer(
     mut stream: WebSocketStream<TcpStream>,
     greeting: Vec<Message>,
     script: Script,
-    kept: Arc<Mutex<Vec<(usize, Vec<u8>)>>>,
+    kept: Received,
 ) {
     for message in greeting {
         if stream.send(message).await.is_err() {

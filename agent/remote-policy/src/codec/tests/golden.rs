@@ -54,7 +54,7 @@ fn openpi_results_of_every_number_type_are_read() {
 #[test]
 fn vla_eval_observations_are_read_in_every_form_of_the_image() {
     let image = image();
-    for form in ["png", "jpeg", "raw"] {
+    for form in ["png", "jpeg", "array", "raw"] {
         let frame = golden(&format!("vla_eval_observation_{form}.msgpack"));
         let message = Message::decode(&frame).expect(form);
         assert_eq!((message.kind, message.sequence), (Kind::Observation, 3));
@@ -68,17 +68,18 @@ fn vla_eval_observations_are_read_in_every_form_of_the_image() {
         let states = Array::from_value(message.payload.field("states").expect("a key"));
         assert_eq!(states.expect("an array").to_f32(), STATE);
     }
-    let payload = Value::map([
-        (
-            "images",
-            Value::map([("primary", image_value(&image, ImageForm::Raw).expect("an image"))]),
-        ),
-        ("task_description", Value::text("stack the cubes")),
-        ("states", state(vla_eval::KEYS)),
-    ]);
-    let message =
-        Message { kind: Kind::Observation, payload, sequence: 3, timestamp: 1_700_000_000.25 };
-    assert_eq!(message.encode().expect("encodes"), golden("vla_eval_observation_raw.msgpack"));
+    for (name, form) in [("array", ImageForm::Array(vla_eval::KEYS)), ("raw", ImageForm::Raw)] {
+        let primary = image_value(&image, form).expect("an image");
+        let payload = Value::map([
+            ("images", Value::map([("primary", primary)])),
+            ("task_description", Value::text("stack the cubes")),
+            ("states", state(vla_eval::KEYS)),
+        ]);
+        let (kind, timestamp) = (Kind::Observation, 1_700_000_000.25);
+        let message = Message { kind, payload, sequence: 3, timestamp };
+        let expected = golden(&format!("vla_eval_observation_{name}.msgpack"));
+        assert_eq!(message.encode().expect("encodes"), expected, "{name}");
+    }
 }
 
 #[test]
