@@ -45,6 +45,9 @@ mod any_policy;
 // The page of a run in a browser.
 mod report_page;
 
+// Small checkpoints compared with the packages of OpenVLA.
+mod reference;
+
 // The time of decisions.
 mod bench;
 
