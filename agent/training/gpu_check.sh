@@ -2,13 +2,13 @@
 # Checks a machine with an NVIDIA GPU: builds with CUDA, compares with the CPU kernels and with OpenVLA's
 # packages, times a 7B checkpoint, and writes a report.
 #
-#   agent/training/gpu_check.sh --python PYTHON [--device cuda] [--size 7b] [--out gpu-check]
+#   agent/training/gpu_check.sh --python PYTHON [--device cuda] [--size 7b] [--out runs/gpu-check]
 #
 # PYTHON has the packages of requirements-reference.lock and PyTorch. The 7B checkpoint takes 15 GB of disk,
 # 17 GB of memory and 16 GB on the card. `--device cpu --size small` runs the same lines without a GPU.
 set -euo pipefail
 
-python=python3 device=cuda size=7b out=gpu-check
+python=python3 device=cuda size=7b out=runs/gpu-check
 while (($#)); do
   case $1 in
     --python) python=$2 ;;
