@@ -37,8 +37,7 @@ fn vicuna(datasets: &[&str]) -> Value {
 }
 
 fn statistics(scale: f64) -> Value {
-    let (low, high) = ([-scale; 7], [scale; 7]);
-    json!({"action": {"q01": low, "q99": high, "mask": [true, true, true, true, true, true, false]}})
+    json!({"action": {"q01": vec![-scale; 7], "q99": vec![scale; 7], "mask": [true, true, true, true, true, true, false]}})
 }
 
 /// The configuration of a folder with this config.json and other files.
@@ -107,7 +106,7 @@ fn a_missing_mask_is_all_true_and_an_unused_dataset_spoils_nothing() -> Result<(
     let mut config = openvla();
     let mask = config["norm_stats"]["bridge_orig"]["action"].as_object_mut();
     mask.expect("statistics").remove("mask");
-    config["norm_stats"]["kuka"]["action"]["q01"] = vec![0.0; 14].into();
+    config["norm_stats"]["kuka"]["action"]["q01"] = json!(vec![0.0; 14]);
     config["norm_stats"]["droid"] = json!("none");
     assert_eq!(read(&config, &[], &key("bridge_orig"))?.action_scale.mask, [true; 7]);
     let refused = reason(read(&config, &[], &key("kuka")));
@@ -247,4 +246,28 @@ fn quantised_weights_are_refused_in_words() {
     };
     let refused = refusal(load_changed("tiny", |_| Ok(()), told));
     assert!(refused.contains("expected weights of 16 or 32 bits, got bitsandbytes"), "{refused}");
+}
+
+#[test]
+fn an_irregular_chain_of_thought_costs_no_action() -> Result<()> {
+    let strict = tiny("tiny", Backend::Kernels)?;
+    let partly = |config: &mut Value| config["reasoning_strict"] = false.into();
+    let lenient = load_changed("tiny", |_| Ok(()), partly)?;
+    assert_ne!(strict.parser().digest(), lenient.parser().digest(), "they act differently");
+    let golden = Golden::load(&fixtures().join("tiny/activations.safetensors"))?;
+    let mut good = golden.ids("forced")?;
+    assert_eq!(good.pop(), Some(2), "the golden completion ends with </s>");
+    let whole = lenient.parser().parse(&good).expect("it is well formed");
+    assert_eq!(Ok(&whole), strict.parser().parse(&good).as_ref());
+    assert!(whole.reasoning.unread.is_empty());
+    // Only the tokens of the action, as after a dropped chain of thought.
+    let action = &good[good.len() - 7..];
+    assert!(strict.parser().parse(action).is_err());
+    let parsed = lenient.parser().parse(action).expect("the action is there");
+    assert_eq!((&parsed.actions, &parsed.action_tokens), (&whole.actions, &whole.action_tokens));
+    assert_eq!(parsed.reasoning.unread.len(), decision::TAGS.len());
+    // Without an action there is nothing to execute.
+    let error = lenient.parser().parse(&good[..good.len() - 3]).expect_err("four tokens");
+    assert_eq!(error.to_string(), "expected 7 action tokens, got 4");
+    Ok(())
 }
