@@ -22,9 +22,11 @@ fn small_checkpoints_agree_with_the_packages_of_the_reference() {
     let python = environment(&training.join("requirements-reference.lock"));
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("reference");
     let program = rever().get_program().to_owned();
-    for (kind, options) in
-        [("openvla", &["--unnorm-key", "bridge_orig"][..]), ("ecot", &[]), ("v01", &["--reasoning", "off"])]
-    {
+    for (kind, options) in [
+        ("openvla", &["--unnorm-key", "bridge_orig"][..]),
+        ("ecot", &[]),
+        ("v01", &["--reasoning", "off"]),
+    ] {
         let checkpoint = folder.join(kind);
         let script = || {
             let mut command = Command::new(&python);
