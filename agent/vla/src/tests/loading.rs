@@ -145,6 +145,7 @@ fn logits(name: &str, backend: Backend, format: WeightFormat) -> Result<(Tensor,
         candidates: 3,
         temperature: 0.0,
         seed: 0,
+        episode: None,
     };
     let tokens = policy.propose_now(&[request])?.remove(0).candidates.remove(0).tokens;
     Ok((logits, tokens))

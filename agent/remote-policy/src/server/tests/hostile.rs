@@ -14,6 +14,7 @@ const FRAMES: usize = 4_000;
 const SOCKETS: usize = 40;
 
 fn frames() -> usize {
+    #[expect(clippy::disallowed_methods, reason = "a longer run by hand")]
     let number = std::env::var("REVER_FUZZ_FRAMES").ok().and_then(|text| text.parse().ok());
     number.unwrap_or(FRAMES)
 }

@@ -134,6 +134,7 @@ async fn a_vla_eval_client_plays_episodes_with_the_seeds_of_an_evaluation() {
 async fn a_vla_eval_client_that_greets_late_is_understood_and_errors_keep_the_connection() {
     let server = Server::start(1).await;
     let mut client = server.connect().await;
+    #[expect(clippy::disallowed_methods, reason = "the client is late")]
     sleep(Duration::from_millis(300)).await;
     client.send(&hello()).await;
     let (kind, _, _) = answer(&mut client).await;
