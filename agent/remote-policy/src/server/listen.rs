@@ -11,7 +11,7 @@ use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinSet;
-use tokio::time::{sleep, timeout};
+use tokio::time::timeout;
 
 use super::agent::ServedAgent;
 use super::http::{Service, busy};
@@ -60,8 +60,10 @@ pub async fn serve(
             Ok((stream, _)) => stream,
             Err(error) => {
                 tracing::warn!("cannot accept a connection: {error}");
-                sleep(ACCEPT_PAUSE).await;
-                continue;
+                match timeout(ACCEPT_PAUSE, stop.wait_for(|stop| *stop)).await {
+                    Ok(_) => break,
+                    Err(_) => continue,
+                }
             }
         };
         prepare(&stream);
