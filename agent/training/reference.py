@@ -1,7 +1,7 @@
 """Builds checkpoints with OpenVLA's own packages and random weights, and compares rever with them.
 
 python agent/training/reference.py build FOLDER --kind openvla --size small
-python agent/training/reference.py compare FOLDER --rever target/release/rever
+python agent/training/reference.py compare FOLDER --rever target/release/rever -- OPTIONS OF REVER
 
 Kinds: openvla (DINOv2 + SigLIP, Llama), ecot (SigLIP, Vicuna's prompt, reasoning), v01 (SigLIP,
 Vicuna's prompt). Sizes: small (small towers and decoder), real-towers (the towers' real sizes), 7b
@@ -87,10 +87,12 @@ def main() -> None:
         help="largest difference of logits, relative to their standard deviation",
     )
     compare_.add_argument("--json", type=Path, help="also write the figures to this file")
-    compare_.add_argument("options", nargs="*", help="options for rever, after --")
     for one in (build_, compare_):
         one.add_argument("--reference", type=Path, help="a clone of openvla/openvla")
-    arguments = parser.parse_args()
+    words = sys.argv[1:]
+    end = words.index("--") if "--" in words else len(words)
+    arguments = parser.parse_args(words[:end])
+    arguments.options = words[end + 1 :]
     # Two threads that share a busy core wait for each other longer than they compute.
     torch.set_num_threads(max(1, (os.cpu_count() or 1) // 2))
     if arguments.command == "build":
@@ -251,7 +253,7 @@ def compare(arguments: argparse.Namespace) -> bool:
     with tempfile.TemporaryDirectory() as temporary:
         outputs = Path(temporary) / "outputs.safetensors"
         subprocess.run(
-            [arguments.rever, "bench", "parity", "--policy", folder,
+            [arguments.rever.resolve(), "bench", "parity", "--policy", folder,
              "--observations", folder / "observations.safetensors", "--tensors", outputs,
              *arguments.options],
             check=True,
