@@ -46,6 +46,9 @@ mod policy_servers;
 // The page of a run in a browser.
 mod report_page;
 
+// Small checkpoints compared with the packages of OpenVLA.
+mod reference;
+
 // The time of decisions.
 mod bench;
 

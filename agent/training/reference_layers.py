@@ -26,7 +26,8 @@ def random_like(name: str, tensor: Tensor) -> Tensor:
     """Each layer changes its input about as much as a trained one; norms are near 1."""
     noise = torch.randn(tensor.shape)
     if tensor.ndim == 1:
-        is_scale = "norm" in name and name.endswith("weight") or name.endswith("scale_factor")
+        is_norm = "norm" in name and name.endswith("weight")
+        is_scale = is_norm or name.endswith("scale_factor")
         return float(is_scale) + 0.1 * noise
     if name.endswith(("embed_tokens.weight", "cls_token", "reg_token", "latent")):
         return 0.5 * noise
@@ -109,7 +110,7 @@ def logits(
 
 
 def action(ids: list[int], statistics: dict[str, Any], size: int, bins: int) -> np.ndarray:
-    """predict_action's formula, then SIMPLER's: Euler angles to a rotation vector, gripper -1 or 1."""
+    """predict_action's formula, then SIMPLER's: rotation vector, gripper -1 or 1."""
     edges = np.linspace(-1, 1, bins)
     centres = (edges[:-1] + edges[1:]) / 2
     normalised = centres[np.clip(size - np.array(ids) - 1, 0, len(centres) - 1)]

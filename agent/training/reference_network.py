@@ -95,7 +95,7 @@ class VisionBackbone(nn.Module):
     def __init__(self, ids: list[str], side: int) -> None:
         super().__init__()
         names = ("featurizer", "fused_featurizer")[: len(ids)]
-        for name, identifier in zip(names, ids):
+        for name, identifier in zip(names, ids, strict=True):
             tower = timm.create_model(identifier, pretrained=False, num_classes=0, img_size=side)
             for module in tower.modules():
                 # transformers rewrites names with `gamma`, so OpenVLA's files have another one.
@@ -110,7 +110,7 @@ class VisionBackbone(nn.Module):
     def forward(self, pixels: Tensor) -> Tensor:
         """(images, 3 x towers, side, side) -> (images, patches, width of all towers)"""
         features = []
-        for name, part in zip(self.names, pixels.split(3, dim=1)):
+        for name, part in zip(self.names, pixels.split(3, dim=1), strict=True):
             tower = getattr(self, name)
             features.append(tower.get_intermediate_layers(part, n={len(tower.blocks) - 2})[0])
         return torch.cat(features, dim=2)
@@ -175,7 +175,9 @@ def pixels(image: Tensor, fused: bool) -> Tensor:
     parts = []
     for mean, deviation in towers:
         shape = (1, 3, 1, 1)
-        parts.append((scaled - torch.tensor(mean).view(shape)) / torch.tensor(deviation).view(shape))
+        parts.append(
+            (scaled - torch.tensor(mean).view(shape)) / torch.tensor(deviation).view(shape)
+        )
     return torch.cat(parts, dim=1)
 
 

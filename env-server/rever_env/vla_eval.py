@@ -82,7 +82,7 @@ class ReverBenchmark(StepBenchmark):  # type: ignore[misc] # vla-eval has no typ
         self._offered = _chosen(tasks)
         self._is_grid = layouts == _GRID
         self._seed = seed
-        self._size = {"image_height": image_height, "image_width": image_width}
+        self._size: dict[str, Any] = {"image_height": image_height, "image_width": image_width}
         self._sends_state = send_state
         self._gripper = gripper
         self._env: BridgeEnv | None = None

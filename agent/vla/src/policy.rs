@@ -227,7 +227,7 @@ impl Vla {
     }
 
     /// Maximum number of tokens after a prompt of this length and the image.
-    fn tokens_max(&self, prompt_ids: usize) -> usize {
+    pub(crate) fn tokens_max(&self, prompt_ids: usize) -> usize {
         let side = self.parser.config.towers[0].side();
         let room = self.network.decoder.positions_max().saturating_sub(prompt_ids + side * side);
         self.parser.config.completion_tokens_max.min(room)

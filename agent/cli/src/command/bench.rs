@@ -55,8 +55,6 @@ struct ThroughputArguments {
     /// Simulator of these servers
     #[arg(long, value_enum, default_value_t)]
     simulator: Simulator,
-    #[command(flatten)]
-    policy: PolicyArguments,
     /// File of the verifier [default: verifier.safetensors in the policy's folder, if it exists]
     #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
     verifier: Option<PathBuf>,
@@ -66,6 +64,8 @@ struct ThroughputArguments {
     /// Also write the figures to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
 }
 
 /// Measure the network's share of a control step: its time minus the simulator's

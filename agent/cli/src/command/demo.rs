@@ -32,8 +32,6 @@ pub struct Arguments {
     /// Random seed of initial layouts and samples
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    #[command(flatten)]
-    policy: PolicyArguments,
     /// Folder of the run; rerun the same command to resume it [default: a folder under runs/]
     #[arg(long)]
     out: Option<PathBuf>,
@@ -43,6 +41,8 @@ pub struct Arguments {
     /// Python interpreter for the servers, which must have env-server's packages [default: an environment that rever sets up]
     #[arg(long)]
     python: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
 }
 
 /// Runs the demonstration, then prints its results and the path of its page.

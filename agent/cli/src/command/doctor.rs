@@ -31,8 +31,6 @@ const IMAGE_SIZE_DEFAULT: (usize, usize) = (128, 128);
 /// Check what a run needs and change nothing: Python, rendering, policy, verifier, servers
 #[derive(Debug, Clone, Args)]
 pub struct Arguments {
-    #[command(flatten)]
-    policy: PolicyArguments,
     /// File of the verifier [default: verifier.safetensors in the policy's folder]
     #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
     verifier: Option<PathBuf>,
@@ -51,6 +49,8 @@ pub struct Arguments {
     /// Also write the findings to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
 }
 
 /// What one check found.

@@ -67,7 +67,8 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     };
     let outcome = arguments.episodes_arguments.run(host, request)?;
     show(&outcome, arguments.json.as_deref(), output)?;
-    println!("next: rever report {}", outcome.folder.display());
+    let policy = arguments.episodes_arguments.policy.source.words();
+    println!("next: rever report {}{policy}", outcome.folder.display());
     Ok(())
 }
 

@@ -19,7 +19,7 @@ use super::loading::LoadingProgress;
 use super::policy_server::ServerArguments;
 use crate::files::{self, VERIFIER_FILE};
 
-/// Which policy, and what it runs on.
+/// Which policy, and what it runs on. The help's heading stays in force after it, so it is the last field of a command.
 #[derive(Debug, Clone, Default, Args)]
 #[command(next_help_heading = "Policy and verifier")]
 pub struct PolicyArguments {

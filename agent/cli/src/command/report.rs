@@ -36,9 +36,6 @@ pub struct Arguments {
     /// The report's folder [default: `report` in the run's folder]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
-    /// The policy that the run was made with; its tokenizer turns tokens into text
-    #[command(flatten)]
-    policy: PolicySource,
     /// Verifier that scored the run, to show the terms of its scores
     /// [default: verifier.safetensors in the policy's folder]
     #[arg(long, value_name = "FILE")]
@@ -59,6 +56,9 @@ pub struct Arguments {
     /// Also write the results to this file
     #[arg(long, value_name = "FILE", value_parser = super::output_file)]
     json: Option<PathBuf>,
+    /// The policy that the run was made with; its tokenizer turns tokens into text
+    #[command(flatten)]
+    policy: PolicySource,
 }
 
 /// Builds the report and says where it is.

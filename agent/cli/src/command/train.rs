@@ -37,9 +37,6 @@ pub struct Arguments {
     /// Label store to train on; episodes that cannot be used are skipped and counted
     #[arg(long, default_value = "runs/labels.sqlite", conflicts_with = "runs")]
     labels: PathBuf,
-    /// The policy that collected the episodes
-    #[command(flatten)]
-    policy: PolicySource,
     /// File to write the verifier to
     #[arg(long, default_value = "verifier.safetensors", value_parser = super::output_file)]
     out: PathBuf,
@@ -85,6 +82,9 @@ pub struct Arguments {
     /// Keep publishing until Ctrl-C, so that agents that start later receive the verifier
     #[arg(long, requires = "name")]
     keep_publishing: bool,
+    /// The policy that collected the episodes
+    #[command(flatten)]
+    policy: PolicySource,
 }
 
 /// The file that `--json` writes.
@@ -137,7 +137,8 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         };
         write_whole(json, &serde_json::to_vec_pretty(&result)?)?;
     }
-    println!("next: rever evaluate --strategies sample,verifier --verifier {out}");
+    let policy = arguments.policy.words();
+    println!("next: rever evaluate{policy} --strategies sample,verifier --verifier {out}");
     match &arguments.name {
         Some(name) => publish(&arguments, name, &verifier),
         None => Ok(()),

@@ -60,9 +60,10 @@ pub async fn serve(
             Ok((stream, _)) => stream,
             Err(error) => {
                 tracing::warn!("cannot accept a connection: {error}");
-                // Nothing tells when there are descriptors again; a stop ends the pause.
-                let _ = timeout(ACCEPT_PAUSE, stop.wait_for(|stop| *stop)).await;
-                continue;
+                match timeout(ACCEPT_PAUSE, stop.wait_for(|stop| *stop)).await {
+                    Ok(_) => break,
+                    Err(_) => continue,
+                }
             }
         };
         prepare(&stream);

@@ -12,6 +12,10 @@ pub fn fit(image: Image, (height, width): (usize, usize)) -> Result<Image> {
     if (image.height, image.width) == (height, width) {
         return Ok(image);
     }
+    // A policy without images.
+    if height == 0 || width == 0 {
+        return Ok(Image::default());
+    }
     let pixels = image.pixels.to_vec();
     let source = RgbImage::from_raw(image.width as u32, image.height as u32, pixels)
         .context("image: expected height x width x 3 bytes")?;

@@ -32,8 +32,8 @@ impl Projector {
         let mut layers = Vec::new();
         for (index, pair) in widths.windows(2).enumerate() {
             let mut part = weights.part(&format!("fc{}", index + 1));
-            let weight = part.take_to_host("weight", &[pair[1], pair[0]])?;
             let bias = part.take("bias", &[pair[1]])?;
+            let weight = part.take_to_host("weight", &[pair[1], pair[0]])?;
             layers.push(Linear::new(&weight, Some(bias), &target)?);
         }
         Ok(Projector { layers, backend: target.backend })

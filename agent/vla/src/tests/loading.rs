@@ -159,7 +159,7 @@ fn sixteen_and_eight_bits_compute_nearly_the_same() -> Result<()> {
         // On the CPU candle multiplies f16 but not bf16; a GPU uses bf16 through the same code.
         let halved = logits(name, Backend::Tensors(DType::F16), WeightFormat::Exact)?;
         let eight = logits(name, Backend::Kernels, WeightFormat::Eight)?;
-        for (kind, (got, _), limit) in [("16", &halved, 0.01), ("8", &eight, 0.1)] {
+        for (kind, (got, _), limit) in [("16", &halved, 0.05), ("8", &eight, 0.5)] {
             let difference = largest_difference(&expected, got)? / spread;
             println!("{name}: {kind} bits: {difference:.1e} of the logits' deviation");
             assert!(difference > 0.0 && difference < limit, "{name}: {kind} bits: {difference}");
@@ -175,7 +175,7 @@ fn a_session_s_caches_have_a_known_size() -> Result<()> {
     // Two layers, keys and values, 32 wide, 4 bytes: 512 bytes per position.
     let prompt = policy.parser.prompter.ids("")?.len() + 64;
     let prefix = (16 + prompt).next_multiple_of(8);
-    let tail = (policy.parser.config.completion_tokens_max + 1).next_multiple_of(64);
+    let tail = (policy.tokens_max(prompt) + 1).next_multiple_of(64);
     assert_eq!(policy.cache_bytes(1)?, 512 * (prefix + tail));
     assert_eq!(policy.cache_bytes(5)?, 512 * (prefix + 5 * tail));
     let halved = tiny("tiny", Backend::Tensors(DType::F16))?;

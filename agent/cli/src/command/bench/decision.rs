@@ -17,8 +17,6 @@ use crate::files;
 /// Measure one decision at a time on recorded observations: prefill, decode, parse, score, choose
 #[derive(Debug, Args)]
 pub struct Arguments {
-    #[command(flatten)]
-    policy: PolicyArguments,
     /// File of the verifier [default: verifier.safetensors in the policy's folder, if it exists]
     #[arg(long, value_name = "FILE", help_heading = "Policy and verifier")]
     verifier: Option<PathBuf>,
@@ -37,6 +35,8 @@ pub struct Arguments {
     /// Also write the figures to this file
     #[arg(long, value_name = "FILE", value_parser = output_file)]
     json: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
 }
 
 /// Runs the benchmark and prints its table.

@@ -1,5 +1,5 @@
-//! Mutated frames: no panic, a clear reason, and the server goes on. `REVER_FUZZ_FRAMES` is the
-//! number of frames; the default is for every run of the tests.
+//! Mutated frames: no panic, a clear reason, and the server goes on. The variable
+//! `REVER_FUZZ_FRAMES`, read when the tests are compiled, is the number of frames of a long run.
 
 use super::super::openpi::OpenpiClient;
 use super::super::session::Session;
@@ -14,9 +14,8 @@ const FRAMES: usize = 4_000;
 const SOCKETS: usize = 40;
 
 fn frames() -> usize {
-    #[expect(clippy::disallowed_methods, reason = "a longer run by hand")]
-    let number = std::env::var("REVER_FUZZ_FRAMES").ok().and_then(|text| text.parse().ok());
-    number.unwrap_or(FRAMES)
+    let number = option_env!("REVER_FUZZ_FRAMES");
+    number.map_or(FRAMES, |number| number.parse().expect("REVER_FUZZ_FRAMES is a number"))
 }
 
 /// A small generator of pseudo-random numbers (SplitMix64), so that a failure can be repeated.

@@ -1,7 +1,6 @@
 //! openpi's and vla-eval's wires and `/act`: frames, episodes, seeds, chunks, errors.
 
 use decision::{TaskId, episode_name, sampling_seed, step_seed};
-use tokio::time::sleep;
 
 use super::*;
 
@@ -134,11 +133,10 @@ async fn a_vla_eval_client_plays_episodes_with_the_seeds_of_an_evaluation() {
 async fn a_vla_eval_client_that_greets_late_is_understood_and_errors_keep_the_connection() {
     let server = Server::start(1).await;
     let mut client = server.connect().await;
-    #[expect(clippy::disallowed_methods, reason = "the client is late")]
-    sleep(Duration::from_millis(300)).await;
-    client.send(&hello()).await;
+    // The server has not waited any longer.
     let (kind, _, _) = answer(&mut client).await;
     assert_eq!(kind, "hello");
+    client.send(&hello()).await;
     client.send(&message("observation", Value::map([]), 2)).await;
     let (kind, sequence, _) = answer(&mut client).await;
     assert_eq!((&*kind, sequence), ("error", 2));
