@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use decision::{
-    Decider, DecisionRequest, EpisodeContext, Image, Observation, Policy, Scorer, Setting, Strategy,
+    Decider, DecisionRequest, EpisodeContext, Image, Observation, Policy, Scorer, Setting,
 };
 use evaluation::statistics::quantile;
 use futures_util::{SinkExt, StreamExt};
@@ -212,7 +212,7 @@ fn request(wire: usize, observation: &Observation, seed: u64) -> Result<Vec<u8>>
     ))
 }
 
-fn message(kind: &'static str, payload: Value<'_>) -> Value<'_> {
+fn message<'a>(kind: &'static str, payload: Value<'a>) -> Value<'a> {
     Value::map([
         ("type", Value::text(kind)),
         ("payload", payload),
