@@ -56,6 +56,8 @@ FIT_STEPS_MAX = 400
 # Both sides in 32 bits.
 TOLERANCE = 1e-3
 ACTION_TOLERANCE = 1e-6
+# The difference where the reference has no action and rever has one.
+NO_ACTION = 1e9
 SHARD_BYTES = 2_000_000_000
 SMALL_TEXT = {
     "hidden_size": 64, "intermediate_size": 160, "num_hidden_layers": 2, "num_attention_heads": 4,
@@ -347,6 +349,8 @@ class Reference:
         if action is None:
             return None
         ids = [token for token in best if token >= llama.SIZE - BINS][:ACTIONS]
+        if len(ids) < ACTIONS:
+            return NO_ACTION
         statistics = next(iter(self.config["norm_stats"].values()))["action"]
         expected = reference_layers.action(ids, statistics, llama.SIZE, BINS)
         return float((torch.tensor(expected) - action.double()).abs().max())
