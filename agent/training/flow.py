@@ -213,7 +213,7 @@ def write(directory: Path, policy: FlowPolicy) -> None:
     }
     checkpoint.replace(directory / "config.json", json.dumps(config, indent=2) + "\n")
     policy.tokenizer.save(directory / "tokenizer.json")
-    parts = {"network": policy.network, "vision": policy.vision}
+    parts: dict[str, nn.Module] = {"network": policy.network, "vision": policy.vision}
     weights = {
         f"{part}.{name}": tensor.detach().bfloat16().contiguous()
         for part, module in parts.items()

@@ -10,6 +10,9 @@ use crate::Address;
 use crate::codec::extension::Answer;
 use crate::codec::{Value, encode, openpi, printable};
 
+/// A server that also speaks vla-eval sends its hello as metadata, with the time of sending.
+const TIMESTAMP: &str = "timestamp";
+
 /// A connection to an openpi server, which keeps no state between observations.
 pub struct OpenPi {
     socket: Socket,
@@ -22,7 +25,7 @@ impl OpenPi {
         let metadata = socket.ask(None, CONNECT_WAIT).await;
         let metadata =
             metadata.context("expected an openpi server's metadata as its first frame")?;
-        let metadata = binary(metadata.frame)?;
+        let metadata = lasting(&binary(metadata.frame)?)?;
         Ok((OpenPi { socket }, metadata))
     }
 
@@ -34,6 +37,13 @@ impl OpenPi {
         let result = openpi::map(&frame)?;
         Ok(Reply { actions: openpi::actions_of(&result)?, answer: Answer::read(&result)? })
     }
+}
+
+/// The metadata without the time at which it was sent: the rest must not change during a run.
+fn lasting(frame: &[u8]) -> Result<Vec<u8>> {
+    let Value::Map(mut entries) = openpi::map(frame)? else { bail!("expected a map") };
+    entries.retain(|(key, _)| key.name != TIMESTAMP);
+    encode(&Value::Map(entries))
 }
 
 /// A text frame is the server's error.

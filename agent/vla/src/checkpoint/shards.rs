@@ -129,9 +129,12 @@ fn stored_in(mut file: &File, index: usize) -> Result<Vec<(String, StoredTensor)
     Ok(metadata.tensors().into_iter().map(stored).collect())
 }
 
+/// Reads one number of a file.
+pub type Widen = fn(&[u8]) -> f32;
+
 /// Bytes per number and the conversion of one number; an error for other than floating point
 /// numbers of 16 or 32 bits.
-pub fn number_format(name: &str, dtype: Dtype) -> Result<(usize, fn(&[u8]) -> f32)> {
+pub fn number_format(name: &str, dtype: Dtype) -> Result<(usize, Widen)> {
     Ok(match dtype {
         Dtype::F32 => (4, bytemuck::pod_read_unaligned),
         Dtype::BF16 => (2, |bytes| bytemuck::pod_read_unaligned::<bf16>(bytes).to_f32()),

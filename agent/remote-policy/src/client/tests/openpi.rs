@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use decision::{Policy, Setting, Strategy};
 
 use super::super::episodes::Episodes;
-use super::scripted::{Scripted, frame, metadata, result, result_with};
+use super::scripted::{Script, Scripted, frame, metadata, result, result_with};
 use super::{connect, episode, motions, propose, words};
 use crate::codec::extension::{Announcement, Answer, AnswerCandidate, Ask};
 use crate::codec::{Array, Value, decode, openpi};
@@ -72,6 +72,18 @@ fn a_session_ends_with_its_episode() {
     let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
     runtime.block_on(episodes.end_finished());
     assert_eq!(Arc::strong_count(&session), 1, "only this test holds it");
+}
+
+#[test]
+fn the_time_of_sending_is_no_part_of_the_metadata() {
+    let sent = |seconds: f64| {
+        let metadata = [("model", Value::text("a")), ("timestamp", Value::Float(seconds))];
+        let script: Script = Arc::new(|_, _| Some(vec![result(0.5)]));
+        let server = Scripted::start(0, vec![frame(&Value::map(metadata))], script);
+        let policy = connect(&format!("openpi://{}", server.place), None).expect("a policy");
+        policy.info().digest.clone()
+    };
+    assert_eq!(sent(1.0), sent(2.0));
 }
 
 fn announcing(announcement: &Announcement, answer: Answer) -> Scripted {
