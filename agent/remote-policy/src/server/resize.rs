@@ -2,8 +2,8 @@
 
 use anyhow::{Context, Result};
 use decision::Image;
-use image::RgbImage;
-use image::imageops::{FilterType, resize};
+use fast_image_resize::images::{Image as Pixels, ImageRef};
+use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
 
 /// The image in the policy's size (height, width): unchanged if it has that size, otherwise resized
 /// with a Lanczos filter of radius 3 to exactly these sides, as OpenVLA's Bridge evaluation does. The
@@ -16,11 +16,14 @@ pub fn fit(image: Image, (height, width): (usize, usize)) -> Result<Image> {
     if height == 0 || width == 0 {
         return Ok(Image::default());
     }
-    let pixels = image.pixels.to_vec();
-    let source = RgbImage::from_raw(image.width as u32, image.height as u32, pixels)
-        .context("image: expected height x width x 3 bytes")?;
-    let resized = resize(&source, width as u32, height as u32, FilterType::Lanczos3);
-    Ok(Image { height, width, pixels: resized.into_raw().into() })
+    let failed = "image: cannot be resized";
+    let (source_width, source_height) = (image.width as u32, image.height as u32);
+    let source = ImageRef::new(source_width, source_height, &image.pixels, PixelType::U8x3);
+    let source = source.context(failed)?;
+    let mut resized = Pixels::new(width as u32, height as u32, PixelType::U8x3);
+    let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Lanczos3));
+    Resizer::new().resize(&source, &mut resized, &options).context(failed)?;
+    Ok(Image { height, width, pixels: resized.into_vec().into() })
 }
 
 #[cfg(test)]
