@@ -67,7 +67,8 @@ pub struct PolicyServerBench<'a> {
 type Socket = WebSocketStream<TcpStream>;
 
 impl PolicyServerBench<'_> {
-    /// Measures one wire after the other, alternating with decisions in this process. Only one client
+    /// Measures one wire after the other, alternating with decisions in this process, of which every
+    /// second one comes first. Only one client
     /// is connected at a time: a batch would wait for the other.
     pub fn run(&self, mut progress: impl FnMut(usize)) -> Result<Vec<Row>> {
         let mut rows = Vec::new();
@@ -88,15 +89,22 @@ impl PolicyServerBench<'_> {
             progress(round);
             for (index, observation) in self.observations.iter().enumerate() {
                 let seed = (round * self.observations.len() + index) as u64;
-                let (own_ms, own) = self.decide(&decider, observation, seed)?;
                 let request = request(wire, observation, seed)?;
                 request_bytes = request.len();
+                let mut own = None;
+                if (round + index) % 2 == 0 {
+                    own = Some(self.decide(&decider, observation, seed)?);
+                }
                 let (served_ms, served) = self.runtime.block_on(async {
                     if wire == VLA_EVAL {
                         begin_episode(&mut socket).await?;
                     }
                     ask(&mut socket, request).await
                 })?;
+                let (own_ms, own) = match own {
+                    Some(own) => own,
+                    None => self.decide(&decider, observation, seed)?,
+                };
                 ensure!(
                     served == own,
                     "expected the action {own:?} of this process, got {served:?}"
