@@ -1,8 +1,9 @@
 //! Shared by all tests of processes: the built program, Python, and waits with a limit.
 
 use std::fs::Metadata;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
@@ -126,5 +127,41 @@ pub fn wait_for<T>(what: &str, limit: Duration, mut condition: impl FnMut() -> O
         }
         assert!(Instant::now() < deadline, "waited {} s for {what}", limit.as_secs());
         std::thread::park_timeout(Duration::from_millis(LOOK_MS));
+    }
+}
+
+/// A program that prints `ready NAME` once it can be used, NAME being its id or address. Killed when
+/// dropped.
+pub struct ReadyProgram {
+    child: Child,
+    /// What it calls itself.
+    pub name: String,
+}
+
+impl ReadyProgram {
+    /// Starts it and waits until it is ready.
+    pub fn start(mut command: Command) -> ReadyProgram {
+        command.stdin(Stdio::null()).stdout(Stdio::piped());
+        let mut child = command.spawn().expect("the program starts");
+        let stdout = child.stdout.take().expect("its standard output is piped");
+        let mut line = String::new();
+        BufReader::new(stdout).read_line(&mut line).expect("its standard output is text");
+        let name = line.strip_prefix("ready ").and_then(|rest| rest.split_whitespace().next());
+        let name = name.unwrap_or_else(|| panic!("expected \"ready NAME\", got {line:?}"));
+        ReadyProgram { name: name.to_owned(), child }
+    }
+
+    /// Kills it without any cleanup, like a crash.
+    pub fn kill(&mut self) {
+        self.child.kill().expect("the program runs");
+        self.child.wait().expect("a killed program ends");
+    }
+}
+
+impl Drop for ReadyProgram {
+    fn drop(&mut self) {
+        // It may have ended already, which is fine.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
     }
 }

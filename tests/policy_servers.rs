@@ -1,63 +1,35 @@
 //! Policy servers as policies: the served agent equals the local one, and servers made of the peers'
 //! own packages execute the same chunks.
 
-use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
 
 use store::record::{DecisionRecord, EpisodeRecord};
 
 use crate::evaluation::Evaluation;
-use crate::harness::{peers, repository, rever, run, text};
+use crate::harness::{ReadyProgram, peers, repository, rever, run, text};
 
 const TASK: &str = "widowx_stack_cube";
 /// Actions of a chunk.
 const CHUNK: usize = 3;
 
-/// A running policy server; killed when dropped.
-struct Server {
-    child: Child,
-    /// Host and port.
-    place: String,
+/// `rever serve-policy` of the included policy.
+fn of_rever() -> ReadyProgram {
+    let mut command = rever();
+    command.args(["serve-policy", "--listen", "127.0.0.1:0", "--strategy", "greedy"]);
+    ReadyProgram::start(command)
 }
 
-impl Server {
-    /// Starts a program that prints `ready` and where it listens.
-    fn start(mut command: Command) -> Server {
-        command.stdin(Stdio::null()).stdout(Stdio::piped());
-        let mut child = command.spawn().expect("the program starts");
-        let stdout = child.stdout.take().expect("its standard output is piped");
-        let mut line = String::new();
-        BufReader::new(stdout).read_line(&mut line).expect("its standard output is text");
-        let place = line.trim().strip_prefix("ready ");
-        let place = place.unwrap_or_else(|| panic!("expected \"ready PLACE\", got {line:?}"));
-        let place = place.trim_start_matches("ws://");
-        let place =
-            if place.contains(':') { place.to_owned() } else { format!("127.0.0.1:{place}") };
-        Server { child, place }
-    }
-
-    /// `rever serve-policy` of the included policy.
-    fn of_rever() -> Server {
-        let mut command = rever();
-        command.args(["serve-policy", "--listen", "127.0.0.1:0", "--strategy", "greedy"]);
-        Server::start(command)
-    }
-
-    /// A policy behind a peer's own server.
-    fn of_peer(wire: &str) -> Server {
-        let mut command = peers().command();
-        command.arg(repository().join("tests/policy_server.py")).args([wire, &CHUNK.to_string()]);
-        Server::start(command)
-    }
+/// A policy behind a peer's own server.
+fn of_peer(wire: &str) -> ReadyProgram {
+    let mut command = peers().command();
+    command.arg(repository().join("tests/policy_server.py")).args([wire, &CHUNK.to_string()]);
+    ReadyProgram::start(command)
 }
 
-impl Drop for Server {
-    fn drop(&mut self) {
-        // It may have ended already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// Host and port.
+fn place(server: &ReadyProgram) -> String {
+    let place = server.name.trim_start_matches("ws://");
+    if place.contains(':') { place.to_owned() } else { format!("127.0.0.1:{place}") }
 }
 
 fn evaluate(folder: &Path, name: &str, arguments: &[&str]) -> Vec<EpisodeRecord> {
@@ -85,9 +57,9 @@ fn the_served_agent_decides_as_the_local_one_bit_by_bit() {
     let settings =
         ["--strategies=greedy,verifier", "--candidates=3", "--seed=5", "--all-hidden", &verifier];
     let local = evaluate(folder.path(), "local", &settings);
-    let server = Server::of_rever();
+    let server = of_rever();
     for wire in ["openpi", "vla-eval"] {
-        let policy = format!("--policy={wire}://{}", server.place);
+        let policy = format!("--policy={wire}://{}", place(&server));
         let served = evaluate(folder.path(), wire, &[&settings[..], &[&policy]].concat());
         assert_eq!(served.len(), local.len());
         for (served, local) in served.iter().zip(&local) {
@@ -111,8 +83,8 @@ fn a_chunk_is_the_same_whether_client_or_server_keeps_it() {
     std::fs::write(&profile, chunks).expect("a file");
     let profile = format!("--policy-profile={}", profile.display());
     let episodes = |wire: &str| {
-        let server = Server::of_peer(wire);
-        let policy = format!("--policy={wire}://{}", server.place);
+        let server = of_peer(wire);
+        let policy = format!("--policy={wire}://{}", place(&server));
         evaluate(folder.path(), wire, &["--strategies=sample", &policy, &profile]).remove(0)
     };
     let (openpi, vla_eval) = (episodes("openpi"), episodes("vla-eval"));
@@ -138,8 +110,8 @@ fn a_chunk_is_the_same_whether_client_or_server_keeps_it() {
 
 #[test]
 fn what_a_policy_server_cannot_do_is_refused_before_anything_starts() {
-    let server = Server::of_peer("openpi");
-    let policy = format!("--policy=openpi://{}", server.place);
+    let server = of_peer("openpi");
+    let policy = format!("--policy=openpi://{}", place(&server));
     let nobody = "--policy=vla-eval://127.0.0.1:1".to_owned();
     for (arguments, expected) in [
         (

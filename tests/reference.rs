@@ -40,6 +40,7 @@ fn small_checkpoints_agree_with_the_packages_of_the_reference() {
         let last = said.lines().next_back().unwrap_or_default();
         writeln!(std::io::stderr(), "{kind}: {last}").expect("standard error is open");
         assert!(said.contains("rever and the reference agree on 3 observations"), "{said}");
+        assert!(!said.contains("\"action_difference\": null"), "every action is compared: {said}");
         // A comparison that cannot fail shows nothing: another prompt must differ.
         let mut other = script();
         other.arg("compare").arg(&checkpoint).arg("--rever").arg(&program).arg("--");

@@ -1,9 +1,8 @@
 //! The agent as a policy server, driven by its peers' own programs: `vla-eval run` and openpi's
 //! client.
 
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::Command;
 use std::sync::Arc;
 
 use decision::{
@@ -16,7 +15,7 @@ use verifier::Verifier;
 use vla::{DeviceName, LoadOptions, Vla};
 
 use crate::evaluation::Evaluation;
-use crate::harness::{entries_below, peers, repository, rever, run, succeed, text};
+use crate::harness::{ReadyProgram, entries_below, peers, repository, rever, run, succeed, text};
 
 const SEED: u64 = 3;
 const CANDIDATES: u32 = 5;
@@ -26,36 +25,12 @@ const EPISODES: u32 = 2;
 /// Rows and columns of the included policy's images.
 const SIDE: usize = 128;
 
-/// A running `rever serve-policy`; killed when dropped.
-struct PolicyServer {
-    child: Child,
-    address: String,
-}
-
-impl PolicyServer {
-    fn start(arguments: &[&str]) -> PolicyServer {
-        let mut command = rever();
-        command
-            .args(["serve-policy", "--listen", "127.0.0.1:0", "--seed", &SEED.to_string()])
-            .args(arguments)
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped());
-        let mut child = command.spawn().expect("the program starts");
-        let stdout = child.stdout.take().expect("its standard output is piped");
-        let mut line = String::new();
-        BufReader::new(stdout).read_line(&mut line).expect("its standard output is text");
-        let address = line.trim().strip_prefix("ready ");
-        let address = address.unwrap_or_else(|| panic!("expected \"ready ADDRESS\", got {line:?}"));
-        PolicyServer { address: address.to_owned(), child }
-    }
-}
-
-impl Drop for PolicyServer {
-    fn drop(&mut self) {
-        // It may have ended already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// A running `rever serve-policy`.
+fn served(arguments: &[&str]) -> ReadyProgram {
+    let mut command = rever();
+    command.args(["serve-policy", "--listen", "127.0.0.1:0", "--seed", &SEED.to_string()]);
+    command.args(arguments);
+    ReadyProgram::start(command)
 }
 
 #[test]
@@ -71,10 +46,10 @@ fn vla_eval_with_the_served_agent_equals_an_evaluation_step_by_step() {
     ];
     let evaluation = Evaluation::new(folder.path(), &arguments.each_ref().map(String::as_str));
     evaluation.finish();
-    let server = PolicyServer::start(&[]);
+    let server = served(&[]);
     let results = folder.path().join("vla-eval");
     let configuration = json!({
-        "server": { "url": server.address, "timeout": 300.0 },
+        "server": { "url": server.name, "timeout": 300.0 },
         "output_dir": results,
         "benchmarks": [{
             "benchmark": "rever_env.vla_eval:ReverBenchmark",
@@ -129,7 +104,7 @@ fn openpis_client_gets_the_actions_of_the_decider_bit_by_bit_and_needs_the_key()
     let key = "a-key-for-this-test-alone";
     let key_file = folder.path().join("key");
     std::fs::write(&key_file, key).expect("a file");
-    let server = PolicyServer::start(&["--key-file", key_file.to_str().expect("a path in UTF-8")]);
+    let server = served(&["--key-file", key_file.to_str().expect("a path in UTF-8")]);
     let recorded = recorded();
     let paths: Vec<PathBuf> =
         (0..recorded.len()).map(|index| folder.path().join(format!("{index}.rgb"))).collect();
@@ -144,7 +119,7 @@ fn openpis_client_gets_the_actions_of_the_decider_bit_by_bit_and_needs_the_key()
     let names = [Some("widowx_carrot_on_plate/default/0"), Some("another/default/1"), None];
     let episodes: Vec<Value> =
         names.iter().zip([0, 2, 4]).map(|(name, first)| episode(*name, first)).collect();
-    let plan = |key: Option<&str>| json!({ "address": server.address, "key": key, "side": SIDE, "episodes": episodes });
+    let plan = |key: Option<&str>| json!({ "address": server.name, "key": key, "side": SIDE, "episodes": episodes });
     let mut client = client(folder.path(), &plan(Some(key)));
     let said = succeed(&mut client);
     let replies: Vec<Vec<Value>> = serde_json::from_str(said.trim()).expect("JSON");

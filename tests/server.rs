@@ -1,14 +1,12 @@
 //! A server process for a test: ends with the test, or is killed by it.
 
-use std::io::{BufRead, BufReader};
 use std::net::{Ipv4Addr, TcpListener};
-use std::process::{Child, Stdio};
 
-use crate::harness::{python, repository};
+use crate::harness::{ReadyProgram, python, repository};
 
 /// A server that runs until it is dropped.
 pub struct Server {
-    child: Child,
+    program: ReadyProgram,
     /// The server's id.
     pub id: String,
     /// The endpoint on which it listens, in addition to the one that it connects to.
@@ -60,32 +58,14 @@ impl Server {
         command
             .args(program)
             .args(["serve", "--exit-with-parent", "--connect", connect])
-            .args(arguments)
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped());
-        let mut child = command.spawn().expect("the server starts");
-        let stdout = child.stdout.take().expect("its standard output is piped");
-        let mut line = String::new();
-        BufReader::new(stdout).read_line(&mut line).expect("its standard output is text");
-        let mut words = line.split_whitespace();
-        let id = words.next().filter(|word| *word == "ready").and_then(|_| words.next());
-        let id = id.map(str::to_owned);
-        let id =
-            id.unwrap_or_else(|| panic!("expected a line `ready` of the server, got {line:?}"));
-        Self { child, id, endpoint: endpoint.to_owned() }
+            .args(arguments);
+        let program = ReadyProgram::start(command);
+        let id = program.name.clone();
+        Self { program, id, endpoint: endpoint.to_owned() }
     }
 
     /// Kills it without any cleanup, like a crash.
     pub fn kill(&mut self) {
-        self.child.kill().expect("the server runs");
-        self.child.wait().expect("a killed child ends");
-    }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        // It may have ended already, which is fine.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        self.program.kill();
     }
 }

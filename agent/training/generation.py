@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+import checkpoint
+from actions import DIMENSIONS, actions_from_digits, world_from_model
 from network import Decoder, DecoderLayer, Network, SelfAttention, attend, rotary_table, rotate
+from tokenizer import ACTION_BINS, END
+
+# Reasoning of 17 tokens, 7 action tokens and `</s>`.
+COMPLETION_TOKENS = 25
 
 
 @dataclass
@@ -97,3 +105,18 @@ def attend_cached(
     # (batch, heads, length, head) -> (batch, length, width)
     result: Tensor = attention.o_proj(mixed.transpose(1, 2).reshape(batch, length, width))
     return result
+
+
+def decode(
+    policy: checkpoint.Checkpoint, completion: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Actions in the environment's convention; a malformed completion holds still, gripper open."""
+    size = policy.tokenizer.size
+    digits = size - completion[:, -1 - DIMENSIONS : -1]
+    inside = ((digits >= 1) & (digits <= ACTION_BINS)).all(axis=1)
+    well_formed = inside & (completion[:, -1] == END)
+    actions = world_from_model(
+        actions_from_digits(np.clip(digits, 1, ACTION_BINS), policy.statistics)
+    )
+    actions[~well_formed] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    return actions, well_formed

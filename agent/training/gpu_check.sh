@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Checks a machine with an NVIDIA GPU: builds with CUDA, compares with the CPU kernels and with OpenVLA's
+# Checks a machine with an NVIDIA GPU: builds with CUDA, compares the CPU kernels and the card with OpenVLA's
 # packages, times a 7B checkpoint, and writes a report.
 #
 #   agent/training/gpu_check.sh --python PYTHON [--device cuda] [--size 7b] [--out runs/gpu-check]
@@ -72,6 +72,11 @@ fi
 compare "$folder" "$device" "$bound" --unnorm-key bridge_orig
 
 echo "4. times"
+if [[ $device != cpu ]]; then
+  nvidia-smi --query-gpu=memory.used --format=csv,noheader,nounits --loop=1 > "$out/memory.txt" &
+  sampler=$!
+  trap 'kill "$sampler"' EXIT
+fi
 # One candidate, five and more share each token step; the table has N = 1, 2, 5, 8 and 16.
 "$rever" bench decision --policy "$folder" --unnorm-key bridge_orig --device "$device" --rounds 2 \
   --observations "$folder/observations.safetensors" --json "$out/decision.json"
@@ -79,7 +84,7 @@ echo "4. times"
 "$rever" bench throughput --policy "$folder" --unnorm-key bridge_orig --device "$device" --sessions 1,4,8 \
   --candidates 5 --decisions 32 --json "$out/throughput.json"
 if [[ $device != cpu ]]; then
-  nvidia-smi --query-gpu=memory.used --format=csv,noheader >> "$out/gpu.txt"
+  echo "largest memory in use: $(sort -n "$out/memory.txt" | tail -n 1) MiB" >> "$out/gpu.txt"
 fi
 
 "$python" agent/training/gpu_report.py "$out"

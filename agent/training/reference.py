@@ -56,7 +56,7 @@ FIT_STEPS_MAX = 400
 # Both sides in 32 bits.
 TOLERANCE = 1e-3
 ACTION_TOLERANCE = 1e-6
-# The difference where the reference has no action and rever has one.
+# The difference where rever has an action without seven action tokens.
 NO_ACTION = 1e9
 SHARD_BYTES = 2_000_000_000
 SMALL_TEXT = {
@@ -335,20 +335,20 @@ class Reference:
             "tokens_equal": tokens_equal,
             "logits_difference": difference,
             "logits_deviation": spread,
-            "action_difference": self.action_difference(best, mine.get("action")),
+            "action_difference": self.action_difference(tokens, mine.get("action")),
         }
         within = row["action_difference"] is None or row["action_difference"] < ACTION_TOLERANCE
         close = difference < self.tolerance * spread
-        # With 16-bit matrices tokens of nearly equal likelihood change places.
+        # With 16-bit matrices, rounding may reverse two tokens of nearly equal likelihood.
         tokens_agree = tokens_equal or self.tolerance > TOLERANCE
         row["agrees"] = bool(row["prompt_equal"] and tokens_agree and close and within)
         return row
 
-    def action_difference(self, best: list[int], action: Tensor | None) -> float | None:
-        """From the reference's tokens, un-normalised and converted as SIMPLER does."""
+    def action_difference(self, tokens: list[int], action: Tensor | None) -> float | None:
+        """Of rever's tokens, by the reference's un-normalisation and SIMPLER's conversion."""
         if action is None:
             return None
-        ids = [token for token in best if token >= llama.SIZE - BINS][:ACTIONS]
+        ids = [token for token in tokens if token >= llama.SIZE - BINS][:ACTIONS]
         if len(ids) < ACTIONS:
             return NO_ACTION
         statistics = next(iter(self.config["norm_stats"].values()))["action"]

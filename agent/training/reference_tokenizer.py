@@ -1,8 +1,8 @@
-"""A stand-in for Llama's tokenizer: its form, its special ids and its 32,000 tokens, other words.
+"""A stand-in for Llama's tokenizer: same format, special ids and size (32,000), other words.
 
-Llama's vocabulary is not ours to ship. What matters for a comparison is the form of the file (the
-space is prepended and written as a low line, bytes are the fallback, a token begins the text) and
-id 29871, the single space. `--tokenizer FILE` takes the true one.
+We may not ship Llama's vocabulary. A comparison depends only on the file's format (a space is
+prepended, spaces become "▁", unknown text falls back to bytes, `<s>` begins every text) and on id
+29871, the single space. `--tokenizer FILE` uses the real one.
 """
 
 from __future__ import annotations

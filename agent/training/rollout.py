@@ -19,15 +19,11 @@ from rever_env import tasks
 from rever_env.world import Observation, Statistics, World
 
 import checkpoint
-from actions import DIMENSIONS, actions_from_digits, world_from_model
-from generation import generate
-from tokenizer import ACTION_BINS, END
+from generation import COMPLETION_TOKENS, decode, generate
 
 # Seeds of the held-out random layouts.
 EVALUATION_SEED = 3_000_000_000
 GRID = 24
-# Reasoning of 17 tokens, 7 action tokens and `</s>`.
-COMPLETION_TOKENS = 25
 
 
 @dataclass(frozen=True)
@@ -126,21 +122,6 @@ def measure(
         low=low,
         high=high,
     )
-
-
-def decode(
-    policy: checkpoint.Checkpoint, completion: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Actions in the environment's convention; a malformed completion holds still, gripper open."""
-    size = policy.tokenizer.size
-    digits = size - completion[:, -1 - DIMENSIONS : -1]
-    inside = ((digits >= 1) & (digits <= ACTION_BINS)).all(axis=1)
-    well_formed = inside & (completion[:, -1] == END)
-    actions = world_from_model(
-        actions_from_digits(np.clip(digits, 1, ACTION_BINS), policy.statistics)
-    )
-    actions[~well_formed] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    return actions, well_formed
 
 
 def advance(

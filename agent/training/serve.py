@@ -2,7 +2,7 @@
 
 python agent/training/serve.py --model DIR --wire vla-eval [--port 8001] [--temperature 0]
 
-Needs torch, safetensors, and vla-eval or openpi-client. `serve.toml` is its profile for
+Needs torch, safetensors, tokenizers, and vla-eval or openpi-client. `serve.toml` is its profile for
 `rever evaluate --policy vla-eval://127.0.0.1:8001 --policy-profile agent/training/serve.toml`.
 """
 
@@ -19,12 +19,9 @@ import torch
 from numpy.typing import NDArray
 
 import checkpoint
-from actions import DIMENSIONS, actions_from_digits, world_from_model
-from generation import generate
-from tokenizer import ACTION_BINS, END
+from actions import DIMENSIONS
+from generation import COMPLETION_TOKENS, decode, generate
 
-# Reasoning of 17 tokens, 7 action tokens and `</s>`.
-COMPLETION_TOKENS = 25
 LOOPBACK = "127.0.0.1"
 
 
@@ -50,10 +47,10 @@ class Policy:
             self.temperature,
             self.generator,
         ).numpy()
-        digits = tokenizer.size - completion[:, -1 - DIMENSIONS : -1]
-        if not ((digits >= 1) & (digits <= ACTION_BINS)).all() or completion[0, -1] != END:
-            raise ValueError(f"expected {DIMENSIONS} action tokens and the end, got {digits[0]}")
-        actions = world_from_model(actions_from_digits(digits, self.checkpoint.statistics))
+        actions, well_formed = decode(self.checkpoint, completion)
+        if not well_formed[0]:
+            got = completion[0, -1 - DIMENSIONS :]
+            raise ValueError(f"expected {DIMENSIONS} action tokens and the end, got {got}")
         result: NDArray[np.float32] = actions[0].astype(np.float32)
         return result
 
@@ -107,7 +104,6 @@ def main() -> None:
     parser.add_argument("--temperature", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    torch.set_grad_enabled(False)
     policy = Policy(arguments.model, arguments.temperature, arguments.seed)
     if arguments.wire == "vla-eval":
         serve_vla_eval(policy, arguments.port)

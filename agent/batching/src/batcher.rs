@@ -25,6 +25,16 @@ const WAITING_MAX: usize = 4096;
 /// Passes episodes to the decider and returns their decisions.
 pub struct DecisionBatcher {
     waiting: mpsc::Sender<Waiting>,
+    active: Arc<AtomicUsize>,
+}
+
+/// Counts an episode as running until it is dropped.
+pub struct Active(Arc<AtomicUsize>);
+
+impl Drop for Active {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::AcqRel);
+    }
 }
 
 /// An episode waiting for its decision.
@@ -47,11 +57,18 @@ pub struct Answer {
 }
 
 impl DecisionBatcher {
-    /// Starts the background task; `active` is the number of running episodes.
-    pub fn start(decider: Arc<Decider>, active: Arc<AtomicUsize>) -> DecisionBatcher {
+    /// Starts the background task.
+    pub fn start(decider: Arc<Decider>) -> DecisionBatcher {
         let (waiting, received) = mpsc::channel(WAITING_MAX);
-        tokio::spawn(decide_batches(decider, received, active));
-        DecisionBatcher { waiting }
+        let active = Arc::new(AtomicUsize::new(0));
+        tokio::spawn(decide_batches(decider, received, Arc::clone(&active)));
+        DecisionBatcher { waiting, active }
+    }
+
+    /// Counts one more running episode: a batch waits for its share of them.
+    pub fn activate(&self) -> Active {
+        self.active.fetch_add(1, Ordering::AcqRel);
+        Active(Arc::clone(&self.active))
     }
 
     /// Waits for a decision; `None` if the background task has ended or the decision panicked.

@@ -9,4 +9,4 @@
 
 mod batcher;
 
-pub use batcher::{Answer, DecisionBatcher};
+pub use batcher::{Active, Answer, DecisionBatcher};

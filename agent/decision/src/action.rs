@@ -94,6 +94,17 @@ impl ActionSpace {
         self.scale.len()
     }
 
+    /// The dimensions as a task would describe them, without bounds.
+    pub fn dimensions(&self) -> Vec<Dimension> {
+        let dimension = |index| Dimension {
+            name: if self.gripper == Some(index) { GRIPPER } else { "motion" }.to_owned(),
+            low: None,
+            high: None,
+            discrete: false,
+        };
+        (0..self.length()).map(dimension).collect()
+    }
+
     /// The action that keeps a robot still at the start of an episode: no motion, gripper open.
     pub fn hold_still(dimensions: &[Dimension]) -> Action {
         dimensions.iter().map(|one| if one.name == GRIPPER { 1.0 } else { 0.0 }).collect()

@@ -217,8 +217,8 @@ impl Vla {
         self.network.decoder.step_bytes()
     }
 
-    /// Upper bound of the bytes of keys and values of one session with this number of candidates:
-    /// image and prompt once, a completion of maximum length for each candidate.
+    /// Bytes of keys and values of one session with this number of candidates, for an instruction of
+    /// at most [`INSTRUCTION_TOKENS`]: image and prompt once, a completion of maximum length for each.
     pub fn cache_bytes(&self, candidates: usize) -> Result<usize> {
         let side = self.parser.config.towers.first().map_or(0, TowerConfig::side);
         let prompt = self.parser.prompter.ids("")?.len() + INSTRUCTION_TOKENS;

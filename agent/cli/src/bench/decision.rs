@@ -5,11 +5,10 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use decision::{
-    ActionSpace, Decider, DecisionRequest, EpisodeContext, Observation, Policy, ProposalRequest,
-    Scorer, Setting as EpisodeSetting, Strategy,
+    Decider, DecisionRequest, EpisodeContext, Observation, Policy, ProposalRequest, Scorer,
+    Setting as EpisodeSetting, Strategy,
 };
 use evaluation::statistics::quantile;
-use protocol::Dimension;
 use serde::Serialize;
 use verifier::Verifier;
 use vla::Vla;
@@ -191,7 +190,7 @@ impl DecisionBench<'_> {
         let start = Instant::now();
         let instruction = observation.instruction.clone();
         // Without a well-formed candidate the decision is to hold still.
-        let action = dimensions(&self.policy.info().action_space);
+        let action = self.policy.info().action_space.dimensions();
         let mut context = EpisodeContext::new(setting, seed, instruction, scorer, &action);
         let request = DecisionRequest { observation, context: &mut context };
         let decided = self.runtime.block_on(decider.decide(vec![request]));
@@ -303,17 +302,6 @@ impl Samples {
         self.ms.push(ms);
         self.tokens += tokens;
     }
-}
-
-/// An action's dimensions, as a task would describe them.
-fn dimensions(space: &ActionSpace) -> Vec<Dimension> {
-    let dimension = |index: usize| Dimension {
-        name: if space.gripper == Some(index) { "gripper" } else { "motion" }.to_owned(),
-        low: None,
-        high: None,
-        discrete: false,
-    };
-    (0..space.length()).map(dimension).collect()
 }
 
 /// The strategy that compares candidates: the verifier's, or the medoid, which needs none.

@@ -5,21 +5,19 @@ mod parity;
 mod policy_server;
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
 use evaluation::table::aligned;
 
 use runtime::servers::{Host, LocalSource, ServerSource, Simulator};
-use verifier::Verifier;
 
 use crate::bench::{self, SimulatorsBench, ThroughputBench, WireBench};
 use crate::build_info;
-use crate::command::policy::{LoadedPolicy, PolicyArguments};
+use crate::command::policy::PolicyArguments;
 use crate::files;
 
-/// Benchmark decisions, episodes, the wire and simulators on this machine
+/// Benchmark decisions, the policy server, episodes, the wire and simulators on this machine
 #[derive(Debug, Args)]
 pub struct Arguments {
     #[command(subcommand)]
@@ -222,7 +220,7 @@ fn servers(
 
 fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
     let loaded = arguments.policy.load(host)?;
-    let verifier = verifier(arguments.verifier, &loaded)?;
+    let verifier = loaded.verifier(arguments.verifier)?;
     let count = usize::from(arguments.servers);
     let servers = servers(host, count, arguments.simulator, arguments.python)?;
     let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
@@ -272,11 +270,4 @@ fn write_json(path: &Path, mut figures: serde_json::Value) -> Result<()> {
     figures["commit"] = build_info::build().commit_text().into();
     let text = serde_json::to_string_pretty(&figures)?;
     std::fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
-}
-
-/// The named verifier, or the one in the policy's folder if there is one.
-fn verifier(named: Option<PathBuf>, policy: &LoadedPolicy) -> Result<Option<Arc<Verifier>>> {
-    let file = named.or_else(|| policy.verifier_file());
-    let load = |file: PathBuf| Verifier::load(&file, &policy.policy.info().digest).map(Arc::new);
-    file.map(load).transpose()
 }

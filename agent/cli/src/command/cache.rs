@@ -16,7 +16,7 @@ enum Bound {
 }
 
 /// The number of sessions, at most `wanted`, whose keys and values fit into `given` gigabytes or
-/// into the free memory. A smaller number is said on standard error.
+/// into the free memory. A lowered number is printed on standard error.
 pub fn sessions(
     policy: &Vla,
     device: DeviceName,

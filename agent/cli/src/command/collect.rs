@@ -63,7 +63,11 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     )?;
     println!("labels: {}", episodes_arguments.labels.display());
     show(&outcome, arguments.json.as_deref(), output)?;
-    let policy = episodes_arguments.policy.words();
-    println!("next: rever train {}{policy}", outcome.folder.display());
+    let (policy, folder) = (&episodes_arguments.policy.source, outcome.folder.display());
+    match policy.address() {
+        None => println!("next: rever train {folder}{}", policy.words()),
+        // Training reads the tokens with the checkpoint's own files.
+        Some(_) => println!("next: rever report {folder}"),
+    }
     Ok(())
 }

@@ -29,7 +29,7 @@ struct State {
 }
 
 impl LoadingProgress {
-    /// Of a checkpoint that is called `name`. Who asked for errors only sees no progress.
+    /// For the checkpoint called `name`. With -q nothing is shown.
     pub fn new(name: String) -> LoadingProgress {
         LoadingProgress {
             name,

@@ -12,6 +12,7 @@ use remote_policy::{Address, RemotePolicy};
 use runtime::servers::{Host, data_folder};
 use serde::Deserialize;
 use serde_json::{Value, json};
+use verifier::Verifier;
 use vla::{CompletionParser, DeviceName, LoadOptions, Loading, ReasoningMode, Vla, WeightFormat};
 
 use super::WrongUsage;
@@ -34,7 +35,7 @@ pub struct PolicyArguments {
     /// changes some tokens
     #[arg(long, value_enum, default_value_t, value_name = "BITS")]
     pub weights: WeightBits,
-    /// Gigabytes for keys and values; --sessions is lowered to what fits [default: 75 % of the free memory]
+    /// Gigabytes for keys and values; --sessions (serve-policy: --max-clients) is lowered to what fits [default: 75 % of the free memory]
     #[arg(long, value_name = "GB", value_parser = gigabytes)]
     pub kv_cache: Option<f64>,
 }
@@ -112,7 +113,6 @@ impl PolicyArguments {
     /// Connects to the policy server, if the policy is one.
     pub fn connect(&self, host: &Host) -> Result<Option<LoadedPolicy>> {
         let Some(address) = self.source.address() else {
-            self.server.ensure_unused()?;
             return Ok(None);
         };
         let options = self.source.checkpoint.words();
@@ -133,6 +133,7 @@ impl PolicyArguments {
 
     /// Loads the checkpoint in a folder that [`PolicySource`] has chosen.
     pub fn load_folder(&self, folder: PathBuf, host: &Host) -> Result<LoadedPolicy> {
+        self.server.ensure_unused()?;
         ensure_folder(&folder)?;
         let options = self.source.checkpoint.options();
         let progress = LoadingProgress::new(folder.display().to_string());
@@ -263,6 +264,13 @@ impl LoadedPolicy {
     /// The verifier in the policy's folder, if there is one.
     pub fn verifier_file(&self) -> Option<PathBuf> {
         self.folder.as_deref().and_then(verifier_beside)
+    }
+
+    /// The named verifier, or the one in the policy's folder if there is one.
+    pub fn verifier(&self, named: Option<PathBuf>) -> Result<Option<Arc<Verifier>>> {
+        let file = named.or_else(|| self.verifier_file());
+        let load = |file: PathBuf| Verifier::load(&file, &self.policy.info().digest).map(Arc::new);
+        file.map(load).transpose().map_err(wrong_usage)
     }
 }
 

@@ -1,5 +1,7 @@
 //! A policy server as the policy: its arguments, and the settings that it can do.
 
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -93,10 +95,12 @@ impl ServerArguments {
     }
 }
 
-fn read_key(file: &Path) -> Result<String> {
-    let bytes = std::fs::metadata(file)?.len();
-    ensure!(bytes <= KEY_BYTES_MAX, "expected at most {KEY_BYTES_MAX} bytes, got {bytes}");
-    checked(&std::fs::read_to_string(file)?)
+/// Reads the key in a file.
+pub fn read_key(file: &Path) -> Result<String> {
+    let mut key = String::new();
+    let bytes = File::open(file)?.take(KEY_BYTES_MAX + 1).read_to_string(&mut key)?;
+    ensure!(bytes as u64 <= KEY_BYTES_MAX, "expected at most {KEY_BYTES_MAX} bytes, got more");
+    checked(&key)
 }
 
 fn checked(key: &str) -> Result<String> {

@@ -15,15 +15,11 @@ use runtime::servers::Host;
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
-use verifier::Verifier;
 
 use super::evaluate::temperature;
 use super::names::StrategyParser;
-use super::policy::{LoadedPolicy, PolicyArguments};
-use super::{Output, WrongUsage};
-
-/// The largest file that is read as a key.
-const KEY_BYTES_MAX: u64 = 4096;
+use super::policy::PolicyArguments;
+use super::{Output, WrongUsage, cache, policy_server};
 
 /// Serve the verified agent to vla-eval, to openpi's clients and as OpenVLA's /act, on one port
 #[derive(Debug, Args)]
@@ -98,9 +94,15 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
         );
     }
     let loaded = arguments.policy.load(host)?;
-    let verifier = arguments.verifier(&loaded)?;
+    let verifier = loaded.verifier(arguments.verifier.clone())?;
     let setting = arguments.setting(verifier.is_some())?;
-    let clients_max = usize::from(arguments.max_clients);
+    let PolicyArguments { device, kv_cache, .. } = arguments.policy;
+    let wanted = arguments.max_clients;
+    let clients_max = match &loaded.checkpoint {
+        Some(policy) => cache::sessions(policy, device, kv_cache, wanted, setting.candidates)?,
+        None => wanted,
+    };
+    let clients_max = usize::from(clients_max);
     let (seed, name) = (arguments.seed, loaded.name.clone());
     let form = ActionForm {
         rotation: match arguments.rotation {
@@ -115,7 +117,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     };
     let options = AgentOptions {
         policy: loaded.policy,
-        scorer: verifier.map(|verifier| Arc::new(verifier) as Arc<dyn Scorer>),
+        scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
         setting,
         seed,
         form,
@@ -143,14 +145,6 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
 }
 
 impl Arguments {
-    /// The verifier of `--verifier`, or the one beside the policy's weights if the strategy uses one.
-    fn verifier(&self, loaded: &LoadedPolicy) -> Result<Option<Verifier>> {
-        let path = self.verifier.clone().or_else(|| loaded.verifier_file());
-        let digest = &loaded.policy.info().digest;
-        let verifier = path.map(|path| Verifier::load(&path, digest)).transpose();
-        verifier.map_err(|error| WrongUsage(format!("{error:#}")).into())
-    }
-
     fn setting(&self, has_verifier: bool) -> Result<Setting> {
         let strategy = self.strategy.unwrap_or(match has_verifier {
             true => Strategy::Verifier,
@@ -167,13 +161,6 @@ impl Arguments {
 }
 
 fn read_key(path: &Path) -> Result<ApiKey> {
-    let read = || -> Result<ApiKey> {
-        let bytes = std::fs::metadata(path)?.len();
-        anyhow::ensure!(
-            bytes <= KEY_BYTES_MAX,
-            "expected at most {KEY_BYTES_MAX} bytes, got {bytes}"
-        );
-        ApiKey::new(&std::fs::read_to_string(path)?)
-    };
-    read().map_err(|error| WrongUsage(format!("--key-file {}: {error:#}", path.display())).into())
+    let key = policy_server::read_key(path).and_then(|key| ApiKey::new(&key));
+    key.map_err(|error| WrongUsage(format!("--key-file {}: {error:#}", path.display())).into())
 }

@@ -249,7 +249,8 @@ fn grant_details(pairs: &mut [Pair], opening: usize, details_max: usize) {
     }
 }
 
-/// The outcome of an episode: of its last step, or what it had reached before; `none` where the policy never acted.
+/// The outcome at the last step of an episode, or else the furthest that it had reached before; `none` where the policy
+/// never acted.
 fn outcome(summary: &EpisodeSummary) -> &'static str {
     let statistics = &summary.statistics;
     if never_acted(summary) {

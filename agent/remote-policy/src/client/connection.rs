@@ -45,7 +45,7 @@ pub struct Target {
     pub profile: Profile,
 }
 
-/// What a server says of itself when a client connects.
+/// The metadata that a server sends to a new client.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Greeting {
     /// openpi's metadata, the payload of vla-eval's hello, or nothing.

@@ -57,8 +57,7 @@ struct Shared {
 }
 
 impl RemotePolicy {
-    /// Connects once to learn what the server says of itself. Blocks; must not be called from an
-    /// async runtime.
+    /// Connects once to read the server's metadata. Blocks; must not be called from an async runtime.
     pub fn connect(address: Address, options: ClientOptions) -> Result<RemotePolicy> {
         let place = address.to_string();
         let connect = || RemotePolicy::try_connect(address, options);

@@ -22,6 +22,7 @@ pub(super) async fn act(agent: &Arc<ServedAgent>, body: &[u8]) -> Result<String>
     let value = with_arrays(&body.value)?;
     let observation = agent.options.keys.read(&value, agent.info())?;
     let ask = Ask::read(&value)?.unwrap_or_default();
+    let _active = agent.batcher.activate();
     let mut session = Session::new(Arc::clone(agent));
     session.begin(&digest(&observation), &observation.instruction);
     let decided = session.decide(observation, &ask).await?;

@@ -2,9 +2,8 @@
 //! clients.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicUsize;
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Result, ensure};
 use batching::DecisionBatcher;
 use decision::{Decider, EpisodeContext, Policy, PolicyInfo, Scorer, Setting, TAGS, sampling_seed};
 use protocol::Dimension;
@@ -17,8 +16,6 @@ use crate::codec::extension::{Announcement, Ask};
 const CANDIDATES_MAX: u32 = 16;
 /// Maximum temperature that a client can ask for.
 const TEMPERATURE_MAX: f32 = 10.0;
-/// The name of the gripper's dimension, which `EpisodeContext` looks for.
-const GRIPPER: &str = "gripper";
 
 /// What is served.
 pub struct AgentOptions {
@@ -40,8 +37,6 @@ pub struct AgentOptions {
 pub struct ServedAgent {
     pub(super) options: AgentOptions,
     pub(super) batcher: DecisionBatcher,
-    /// Clients that have sent an observation a moment ago; a batch waits for its share of them.
-    pub(super) active: Arc<AtomicUsize>,
     dimensions: Vec<Dimension>,
 }
 
@@ -59,17 +54,10 @@ impl ServedAgent {
         );
         let space = &options.policy.info().action_space;
         options.form.check(space)?;
-        let dimension = |index| Dimension {
-            name: if space.gripper == Some(index) { GRIPPER.to_owned() } else { String::new() },
-            low: None,
-            high: None,
-            discrete: false,
-        };
-        let dimensions = (0..space.length()).map(dimension).collect();
-        let active = Arc::new(AtomicUsize::new(0));
+        let dimensions = space.dimensions();
         let decider = Arc::new(Decider::new(Arc::clone(&options.policy)));
-        let batcher = DecisionBatcher::start(decider, Arc::clone(&active));
-        Ok(Arc::new(ServedAgent { options, batcher, active, dimensions }))
+        let batcher = DecisionBatcher::start(decider);
+        Ok(Arc::new(ServedAgent { options, batcher, dimensions }))
     }
 
     pub(super) fn info(&self) -> &PolicyInfo {
@@ -91,6 +79,9 @@ impl ServedAgent {
     /// The setting of one decision.
     pub(super) fn setting(&self, ask: &Ask) -> Result<Setting> {
         let own = self.options.setting;
+        if ask.candidates.is_none() && ask.temperature.is_none() {
+            return Ok(own);
+        }
         let temperature = ask.temperature.unwrap_or(own.temperature);
         // Greedy decoding has one candidate.
         let own_candidates = if temperature == 0.0 { 1 } else { own.candidates };
@@ -101,19 +92,18 @@ impl ServedAgent {
             "rever.candidates: expected 1 to {candidates_max}, got {candidates}"
         );
         ensure!(
-            (0.0..=TEMPERATURE_MAX).contains(&temperature),
+            ask.temperature.is_none_or(|asked| (0.0..=TEMPERATURE_MAX).contains(&asked)),
             "rever.temperature: expected 0 to {TEMPERATURE_MAX}, got {temperature}"
         );
-        match (ask.candidates, ask.temperature) {
-            (None, None) => Ok(own),
-            _ if temperature == 0.0 && candidates > 1 => {
-                bail!("rever.candidates: expected 1 at temperature 0, got {candidates}")
-            }
-            _ => Ok(Setting::new(self.strategy(candidates), candidates, temperature)),
-        }
+        ensure!(
+            temperature > 0.0 || candidates == 1,
+            "rever.candidates: expected 1 at temperature 0, got {candidates}"
+        );
+        Ok(Setting::new(self.strategy(candidates), candidates, temperature))
     }
 
-    /// A server of greedy actions that is asked for several candidates sends the first well-formed.
+    /// With one candidate, a server of greedy actions samples if asked to; with several, the first
+    /// well-formed one is sent.
     fn strategy(&self, candidates: u32) -> decision::Strategy {
         use decision::Strategy::{FirstWellFormed, Greedy, Sample};
         match self.options.setting.strategy {

@@ -7,10 +7,10 @@
 
 use std::borrow::Cow;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use anyhow::Result;
+use batching::Active;
 use futures_util::{SinkExt, StreamExt};
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
@@ -33,7 +33,7 @@ const HELLO_WAIT: Duration = Duration::from_millis(100);
 const SEND_WAIT: Duration = Duration::from_secs(30);
 /// How long a closed connection waits for the client's own close.
 const CLOSE_WAIT: Duration = Duration::from_secs(1);
-/// Batches wait for the next observation of a client for so long after its last reply.
+/// A batch waits for a client until this long after its last reply.
 const ACTIVE_WAIT: Duration = Duration::from_secs(1);
 /// Maximum length of the reason in a close frame, which is a limit of WebSocket.
 const REASON_BYTES_MAX: usize = 123;
@@ -46,8 +46,7 @@ pub(super) async fn serve(
     agent: Arc<ServedAgent>,
     mut stop: watch::Receiver<bool>,
 ) {
-    let activity = Activity { agent: Arc::clone(&agent), is_active: false };
-    let mut connection = Connection { socket, agent, activity, has_greeted: false };
+    let mut connection = Connection { socket, agent, activity: None, has_greeted: false };
     let ended = tokio::select! {
         ended = connection.run() => ended,
         _ = stop.wait_for(|stop| *stop) => Err((CloseCode::Away, "the server stops".to_owned())),
@@ -60,7 +59,8 @@ pub(super) async fn serve(
 struct Connection {
     socket: Socket,
     agent: Arc<ServedAgent>,
-    activity: Activity,
+    /// Held while this client is active: batches wait for it.
+    activity: Option<Active>,
     /// Whether the frame that is metadata and hello was sent.
     has_greeted: bool,
 }
@@ -93,7 +93,7 @@ impl Connection {
             self.greet().await?;
         }
         loop {
-            self.activity.begin();
+            self.activity.get_or_insert_with(|| self.agent.batcher.activate());
             self.answer(&mut wire, &frame).await?;
             let Some(next) = self.next_frame().await? else { return Ok(()) };
             frame = next;
@@ -148,7 +148,7 @@ impl Connection {
         if let Ok(frame) = timeout(ACTIVE_WAIT, self.receive()).await {
             return frame;
         }
-        self.activity.rest();
+        self.activity = None;
         self.receive().await
     }
 
@@ -201,32 +201,4 @@ impl Connection {
 
 fn internal(error: anyhow::Error) -> Closing {
     (CloseCode::Error, format!("{error:#}"))
-}
-
-/// Whether this client counts as active; no longer when it is dropped.
-struct Activity {
-    agent: Arc<ServedAgent>,
-    is_active: bool,
-}
-
-impl Activity {
-    fn begin(&mut self) {
-        if !self.is_active {
-            self.agent.active.fetch_add(1, Ordering::AcqRel);
-            self.is_active = true;
-        }
-    }
-
-    fn rest(&mut self) {
-        if self.is_active {
-            self.agent.active.fetch_sub(1, Ordering::AcqRel);
-            self.is_active = false;
-        }
-    }
-}
-
-impl Drop for Activity {
-    fn drop(&mut self) {
-        self.rest();
-    }
 }

@@ -49,9 +49,10 @@ impl Service {
     pub async fn answer(self, request: Request<Incoming>) -> Result<Reply, Infallible> {
         let path = request.uri().path().to_owned();
         let is_health = ["/healthz", "/health"].contains(&&*path);
-        let refusal = if is_health { None } else { self.refusal(&request) };
+        if !is_health && let Some(refusal) = self.refusal(&request) {
+            return Ok(refusal);
+        }
         Ok(match (request.method(), &*path) {
-            _ if refusal.is_some() => refusal.unwrap_or_default(),
             (&Method::GET, "/healthz") => text(StatusCode::OK, "text/plain", "OK\n"),
             (&Method::GET, "/health") => body(StatusCode::OK, &json!({ "status": "ok" })),
             (&Method::GET, "/config") => self.configuration(),

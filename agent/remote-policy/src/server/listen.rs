@@ -19,11 +19,11 @@ use super::key::ApiKey;
 
 /// Maximum size of a message. An uncompressed image of 1024 x 1024 pixels has 3 MB.
 pub const MESSAGE_BYTES_MAX: usize = 16 * 1024 * 1024;
-/// A client must have sent the head of a request after this time.
+/// Timeout for the head of a request.
 const HEADER_WAIT: Duration = Duration::from_secs(10);
-/// Size of a request's head at most.
+/// Maximum size of a request's head.
 const HEADER_BYTES_MAX: usize = 64 * 1024;
-/// Connections that are told that there is no place, at once; others are dropped.
+/// Maximum number of connections that are being refused with status 503; further ones are dropped.
 const REFUSALS_MAX: usize = 16;
 /// A dead machine is noticed after this time without a packet.
 const KEEPALIVE: Duration = Duration::from_secs(60);

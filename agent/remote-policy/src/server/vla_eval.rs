@@ -18,8 +18,9 @@ use crate::codec::{Array, Value};
 /// One client.
 pub(super) struct VlaEvalClient {
     session: Session,
-    /// The name of the episode that the next observation begins.
-    starting: Option<String>,
+    /// The name of the episode that the next observation begins, or why it has none: `episode_start`
+    /// has no reply, so its error is the reply to that observation.
+    starting: Option<Result<String>>,
     /// Observations that came without an episode: after a client's reconnection.
     unnamed: u64,
     /// The rest of a chunk: this wire has one action per observation.
@@ -68,15 +69,8 @@ impl VlaEvalClient {
             },
             Kind::EpisodeStart => {
                 self.forget();
-                Ok(match episode_of(&message.payload) {
-                    Ok(episode) => {
-                        self.starting = Some(episode);
-                        Outcome::Silence
-                    }
-                    Err(error) => {
-                        Outcome::Reply(failure("episode_start_failed", &error, sequence)?)
-                    }
-                })
+                self.starting = Some(episode_of(&message.payload));
+                Ok(Outcome::Silence)
             }
             Kind::EpisodeEnd => {
                 self.forget();
@@ -86,7 +80,8 @@ impl VlaEvalClient {
                 Ok(payload) => self::message(Kind::Action, payload, sequence)?,
                 Err(error) => {
                     self.forget();
-                    failure("observation_failed", &error, sequence)?
+                    tracing::warn!("vla-eval client: {error:#}");
+                    error_message(&format!("observation_failed: {error:#}"), sequence)?
                 }
             })),
             Kind::Error => {
@@ -118,10 +113,13 @@ impl VlaEvalClient {
         let ask = Ask::read(payload)?.unwrap_or_default();
         if !self.session.is_running() {
             let instruction = &observation.instruction;
-            let episode = self.starting.take().unwrap_or_else(|| {
-                self.unnamed += 1;
-                format!("{instruction}/default/{}", self.unnamed - 1)
-            });
+            let episode = match self.starting.take() {
+                Some(episode) => episode.context("episode_start")?,
+                None => {
+                    self.unnamed += 1;
+                    format!("{instruction}/default/{}", self.unnamed - 1)
+                }
+            };
             self.session.begin(&episode, instruction);
         }
         let decided = self.session.decide(observation, &ask).await?;
@@ -190,12 +188,12 @@ pub(super) fn hello_payload(agent: &ServedAgent) -> Result<Value<'static>> {
 fn observation_parameters(agent: &ServedAgent) -> Value<'static> {
     let (height, width) = agent.info().image_size;
     let side = |side: usize| Value::Integer(side as i128);
-    let mut parameters = vec![("image_height", side(height)), ("image_width", side(width))];
-    // A verifier looks at the gripper's position.
-    if agent.options.scorer.is_some() {
-        parameters.push(("send_state", Value::Bool(true)));
-    }
-    Value::map(parameters)
+    Value::map([
+        ("image_height", side(height)),
+        ("image_width", side(width)),
+        // For a verifier, which looks at the gripper's position, and for policies that read the state.
+        ("send_state", Value::Bool(true)),
+    ])
 }
 
 fn action_spec(agent: &ServedAgent) -> Value<'static> {
@@ -232,11 +230,6 @@ fn message(kind: Kind, payload: Value<'static>, sequence: u64) -> Result<Vec<u8>
 /// Seconds since 1970.
 pub(super) fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
-}
-
-fn failure(what: &str, error: &anyhow::Error, sequence: u64) -> Result<Vec<u8>> {
-    tracing::warn!("{what}: {error:#}");
-    error_message(&format!("{what}: {error:#}"), sequence)
 }
 
 fn error_message(reason: &str, sequence: u64) -> Result<Vec<u8>> {

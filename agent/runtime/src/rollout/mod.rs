@@ -72,13 +72,11 @@ impl<P: SessionPool> Rollout<P> {
     pub async fn run(self) -> Result<()> {
         let stop = self.stop.clone();
         let sessions = self.sessions;
-        let active = Arc::new(AtomicUsize::new(0));
-        let batcher = DecisionBatcher::start(Arc::clone(&self.decider), Arc::clone(&active));
+        let batcher = DecisionBatcher::start(Arc::clone(&self.decider));
         let shared = Arc::new(Shared {
             rollout: self,
             batcher,
             first_decisions: FirstDecisions::new(),
-            active,
             leased: AtomicUsize::new(0),
             returned: Notify::new(),
         });
@@ -109,8 +107,6 @@ struct Shared<P> {
     rollout: Rollout<P>,
     batcher: DecisionBatcher,
     first_decisions: FirstDecisions,
-    /// Number of episodes between reset and end.
-    active: Arc<AtomicUsize>,
     /// Number of leases held by workers.
     leased: AtomicUsize,
     /// Notified when a lease was completed, failed or released.
@@ -193,7 +189,7 @@ impl<P: SessionPool> Shared<P> {
             sinks: &self.rollout.sinks,
             pool: &self.rollout.pool,
         };
-        let _active = Active::one_more(&self.active);
+        let _active = self.batcher.activate();
         run.run(session).await
     }
 
@@ -231,22 +227,6 @@ fn never_acted(record: &EpisodeRecord) -> String {
          candidate; the episode has no outcome; first candidate: {reason}",
         record.identity.id()
     )
-}
-
-/// Counts an episode as running until it is dropped.
-struct Active<'a>(&'a AtomicUsize);
-
-impl<'a> Active<'a> {
-    fn one_more(count: &'a AtomicUsize) -> Active<'a> {
-        count.fetch_add(1, Ordering::AcqRel);
-        Active(count)
-    }
-}
-
-impl Drop for Active<'_> {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::AcqRel);
-    }
 }
 
 #[cfg(test)]

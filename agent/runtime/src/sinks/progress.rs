@@ -55,7 +55,7 @@ struct StrategyRate {
     episodes: u64,
 }
 
-/// The last reported reason, and the number of further episodes that broke for it.
+/// The last reported reason, and the number of further attempts that failed for it.
 struct LastFault {
     reason: String,
     at: Instant,
@@ -142,15 +142,15 @@ impl Progress {
             return;
         }
         self.report_others();
-        self.say(&format!("fault: {reason} ({episode} is retried)"));
+        self.say(&format!("fault: {reason} ({episode})"));
         self.last_fault =
             Some(LastFault { reason: reason.to_owned(), at: Instant::now(), others: 0 });
     }
 
-    /// Reports how many further episodes broke for the last reason.
+    /// Reports how many further attempts failed for the last reason.
     fn report_others(&mut self) {
         if let Some(LastFault { others: others @ 1.., .. }) = self.last_fault.take() {
-            self.say(&format!("the same fault in {others} more episodes, which are retried"));
+            self.say(&format!("the same fault in {others} more attempts"));
         }
     }
 

@@ -32,7 +32,7 @@ pub struct Config {
     /// Whether completions contain a chain of thought before the action.
     pub reasoning: bool,
     pub completion_tokens_max: usize,
-    // The identities of checkpoints without the following are older than these fields.
+    // Omitted from the JSON where false, so that older checkpoints keep their digests.
     /// Whether a chain of thought is read as far as possible, instead of refused with its action.
     #[serde(skip_serializing_if = "is_false")]
     pub partial_reasoning: bool,

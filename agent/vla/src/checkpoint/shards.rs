@@ -1,7 +1,7 @@
 //! The tensors in a checkpoint's weight files: where each lies, and its bytes when they are needed.
 //!
-//! Tensors are read one at a time. A checkpoint of 15 GB therefore needs no more memory than the
-//! network made of it, plus its largest tensor.
+//! Tensors are read one at a time. A checkpoint of 15 GB therefore needs the memory of the network
+//! made of it, plus a few times that of its largest tensor.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -82,22 +82,39 @@ impl Shards {
 
 /// The weight files of a checkpoint: a single file, or the shards in the index.
 pub fn weight_files(directory: &Path) -> Result<Vec<PathBuf>> {
-    let single = directory.join("model.safetensors");
+    let single = directory.join(SINGLE_FILE);
     if single.exists() {
         return Ok(vec![single]);
     }
-    let path = directory.join(INDEX_FILE);
-    let text = std::fs::read_to_string(&path).with_context(|| {
-        format!("weights: expected {} or {}, got neither", single.display(), path.display())
-    })?;
-    let index: Index =
-        serde_json::from_str(&text).with_context(|| format!("cannot parse {}", path.display()))?;
+    let index = read_index(directory)?;
     let mut names: Vec<&String> = index.weight_map.values().collect();
     names.sort();
     names.dedup();
     Ok(names.into_iter().map(|name| directory.join(name)).collect())
 }
 
+/// The sorted names of all tensors, from the header of the only file or the index of the shards.
+pub fn tensor_names(directory: &Path) -> Result<Vec<String>> {
+    let single = directory.join(SINGLE_FILE);
+    let mut names: Vec<String> = if single.exists() {
+        stored_in(&File::open(&single)?, 0)?.into_iter().map(|(name, _)| name).collect()
+    } else {
+        read_index(directory)?.weight_map.into_keys().collect()
+    };
+    names.sort();
+    Ok(names)
+}
+
+fn read_index(directory: &Path) -> Result<Index> {
+    let (single, path) = (directory.join(SINGLE_FILE), directory.join(INDEX_FILE));
+    let text = std::fs::read_to_string(&path).with_context(|| {
+        format!("weights: expected {} or {}, got neither", single.display(), path.display())
+    })?;
+    serde_json::from_str(&text).with_context(|| format!("cannot parse {}", path.display()))
+}
+
+/// The only file of a checkpoint without shards.
+const SINGLE_FILE: &str = "model.safetensors";
 /// The index of a sharded checkpoint.
 pub const INDEX_FILE: &str = "model.safetensors.index.json";
 

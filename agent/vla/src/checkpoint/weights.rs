@@ -27,6 +27,8 @@ pub struct Loaded {
 /// The tensors that no layer has taken yet.
 pub struct Weights<'a> {
     shards: &'a Shards,
+    /// Names of the tensors that affect an output, sorted.
+    used: &'a [String],
     left: HashMap<&'a str, &'a StoredTensor>,
     hashing: Option<Hashing>,
     loaded: Loaded,
@@ -72,7 +74,7 @@ impl<'a> Weights<'a> {
     /// are hashed as they are read. `report` is called after each tensor.
     pub fn new(
         shards: &'a Shards,
-        used: &[String],
+        used: &'a [String],
         hashing: Option<Hashing>,
         target: Target,
         report: &'a dyn Fn(Loaded),
@@ -81,6 +83,7 @@ impl<'a> Weights<'a> {
         let bytes_total = used.iter().map(|name| shards.tensors()[name].bytes as u64).sum();
         Weights {
             shards,
+            used,
             left: left.collect(),
             hashing,
             loaded: Loaded { bytes: 0, bytes_total },
@@ -95,9 +98,12 @@ impl<'a> Weights<'a> {
     }
 
     /// Completes the digest. A remaining tensor that is not known to be unused is an error.
-    pub fn finish(self, towers: &[(&str, usize)]) -> Result<Rest> {
-        let (dead, unexpected): (Vec<&str>, Vec<&str>) =
-            self.left.keys().partition(|name| is_dead(name, towers));
+    pub fn finish(self) -> Result<Rest> {
+        let used = self.used;
+        let is_used =
+            |name: &&str| used.binary_search_by(|known| known.as_str().cmp(*name)).is_ok();
+        let (unexpected, dead): (Vec<&str>, Vec<&str>) =
+            self.left.keys().partition(|name| is_used(name));
         if let Some(name) = unexpected.iter().min() {
             bail!(
                 "weights: expected only known tensors, got {} others, such as {name}",

@@ -15,8 +15,8 @@ pub enum Backend {
 }
 
 impl Backend {
-    /// The faster backend of a device. On a GPU, 16-bit matrices halve memory and the time of a
-    /// step; a 7B checkpoint takes 15 GB.
+    /// The faster backend of a device. On a GPU, matrices of 16 bits halve the memory: a 7B checkpoint
+    /// takes 15 GB.
     pub fn for_device(device: &Device) -> Backend {
         if device.is_cpu() { Backend::Kernels } else { Backend::Tensors(DType::BF16) }
     }

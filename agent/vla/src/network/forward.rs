@@ -42,10 +42,7 @@ impl Network {
         let projector = Projector::load(weights.part("projector"), width, hidden, fused)?;
         let vision_backbone =
             VisionBackbone::load(weights.part("vision_backbone"), &config.towers)?;
-        let towers = VisionBackbone::blocks_used(&config.towers);
-        let towers: Vec<(&str, usize)> =
-            towers.iter().map(|(name, blocks)| (name.as_str(), *blocks)).collect();
-        let rest = weights.finish(&towers)?;
+        let rest = weights.finish()?;
         Ok((Network { vision_backbone, projector, decoder }, rest))
     }
 

@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use runtime::servers::Host;
 use vla::DeviceName;
 
-use super::{print_table, verifier, write_json};
+use super::{print_table, write_json};
 use crate::bench::{self, DecisionBench, Report, Torch, read_observations, scaled};
 use crate::command::output_file;
 use crate::command::policy::PolicyArguments;
@@ -47,7 +47,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         arguments.policy.device
     );
     let loaded = arguments.policy.load(host)?;
-    let verifier = verifier(arguments.verifier, &loaded)?;
+    let verifier = loaded.verifier(arguments.verifier)?;
     let recorded = match arguments.observations {
         Some(file) => file,
         None => files::of_checkout(host, "agent/vla/tests/fixtures/bridge-small.safetensors")?,

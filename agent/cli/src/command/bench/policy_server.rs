@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use runtime::servers::Host;
 
-use super::{print_table, verifier, write_json};
+use super::{print_table, write_json};
 use crate::bench::{PolicyServerBench, PolicyServerRow, read_observations, scaled};
 use crate::command::output_file;
 use crate::command::policy::PolicyArguments;
@@ -38,7 +38,7 @@ pub struct Arguments {
 /// Runs the benchmark and prints its table.
 pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let loaded = arguments.policy.load(host)?;
-    let verifier = verifier(arguments.verifier, &loaded)?;
+    let verifier = loaded.verifier(arguments.verifier)?;
     let recorded = files::of_checkout(host, "agent/vla/tests/fixtures/bridge-small.safetensors")?;
     let side = usize::from(arguments.side);
     let observations = scaled(read_observations(&recorded)?, (side, side));
@@ -51,7 +51,7 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         rounds: arguments.rounds as usize,
         runtime: &runtime,
     };
-    let rows = bench.run(|_| {})?;
+    let rows = bench.run()?;
     if let Some(path) = &arguments.json {
         write_json(path, serde_json::json!({ "side": side, "rows": rows }))?;
     }

@@ -7,6 +7,7 @@ use super::super::vla_eval::{Outcome, VlaEvalClient};
 use super::super::{MESSAGE_BYTES_MAX, act};
 use super::*;
 use crate::codec::tests::all_golden;
+use crate::codec::tests::hostile::{Random, mutate};
 
 /// Frames at the decoders, unless the variable says otherwise.
 const FRAMES: usize = 4_000;
@@ -16,42 +17,6 @@ const SOCKETS: usize = 40;
 fn frames() -> usize {
     let number = option_env!("REVER_FUZZ_FRAMES");
     number.map_or(FRAMES, |number| number.parse().expect("REVER_FUZZ_FRAMES is a number"))
-}
-
-/// A small generator of pseudo-random numbers (SplitMix64), so that a failure can be repeated.
-struct Numbers(u64);
-
-impl Numbers {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn below(&mut self, bound: usize) -> usize {
-        (self.next() % bound.max(1) as u64) as usize
-    }
-
-    /// Changes, cuts, repeats or inserts a few bytes.
-    fn mutate(&mut self, frame: &[u8]) -> Vec<u8> {
-        let mut bytes = frame.to_vec();
-        for _ in 0..=self.below(4) {
-            let at = self.below(bytes.len());
-            match self.below(5) {
-                0 if !bytes.is_empty() => bytes[at] ^= 1 << self.below(8),
-                1 if !bytes.is_empty() => bytes[at] = self.next() as u8,
-                2 => bytes.truncate(at),
-                3 => bytes.insert(at, self.next() as u8),
-                _ => {
-                    let end = (at + self.below(32)).min(bytes.len());
-                    bytes.extend_from_within(at..end);
-                }
-            }
-        }
-        bytes
-    }
 }
 
 fn seeds() -> Vec<Vec<u8>> {
@@ -65,11 +30,11 @@ fn seeds() -> Vec<Vec<u8>> {
 #[tokio::test]
 async fn mutated_frames_at_the_decoders_are_answered_or_refused() {
     let agent = agent(1, Strategy::Sample, 1);
-    let (seeds, mut numbers) = (seeds(), Numbers(1));
+    let (seeds, mut random) = (seeds(), Random(1));
     let (mut answered, mut refused) = (0, 0);
     for _ in 0..frames() {
-        let seed = numbers.below(seeds.len());
-        let frame = numbers.mutate(&seeds[seed]);
+        let [seed, other] = [0; 2].map(|_| random.below(seeds.len()));
+        let frame = mutate(&seeds[seed], &seeds[other], &mut random);
         let mut openpi = OpenpiClient::new(Session::new(Arc::clone(&agent)));
         let mut vla_eval = VlaEvalClient::new(Session::new(Arc::clone(&agent)));
         let results = [
@@ -92,10 +57,10 @@ async fn mutated_frames_at_the_decoders_are_answered_or_refused() {
 #[tokio::test]
 async fn mutated_frames_over_sockets_leave_the_server_usable() {
     let server = Server::start(1).await;
-    let (seeds, mut numbers) = (seeds(), Numbers(2));
+    let (seeds, mut random) = (seeds(), Random(2));
     for _ in 0..frames() / SOCKETS {
-        let seed = numbers.below(seeds.len());
-        let frame = numbers.mutate(&seeds[seed]);
+        let [seed, other] = [0; 2].map(|_| random.below(seeds.len()));
+        let frame = mutate(&seeds[seed], &seeds[other], &mut random);
         let mut client = server.connect().await;
         client.socket.send(Message::binary(frame)).await.expect("sent");
         // A message of vla-eval may have no answer; then the server waits for the next frame.

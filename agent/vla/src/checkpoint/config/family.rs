@@ -1,12 +1,12 @@
 //! Recognises checkpoints of other families, and says in one sentence what they are and how they
 //! can be run.
 
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 use anyhow::{Result, bail};
 use serde_json::Value;
+
+use crate::checkpoint::shards;
 
 /// What every policy that is not run here can be.
 const SERVE: &str = "run it with its own program as a policy server and give the address: \
@@ -37,8 +37,6 @@ const OFT_FILES: [&str; 4] =
 const TRACEVLA_TENSOR: &str = "vision_backbone.sep_tok.weight";
 /// Endings of the names of tensors that quantised files have.
 const QUANTISED_ENDINGS: [&str; 5] = [".SCB", ".absmax", ".quant_map", ".qweight", ".qzeros"];
-/// Maximum size of a safetensors header, in bytes.
-const HEADER_BYTES_MAX: u64 = 100_000_000;
 
 /// Refuses every family but OpenVLA's.
 pub fn check(directory: &Path, config: &Value) -> Result<()> {
@@ -113,7 +111,8 @@ fn check_files(directory: &Path) -> Result<()> {
             );
         }
     }
-    for tensor in tensor_names(directory) {
+    // Names that cannot be read are reported by the loader.
+    for tensor in shards::tensor_names(directory).unwrap_or_default() {
         if tensor == TRACEVLA_TENSOR {
             bail!(
                 "{tensor}: this is TraceVLA, which looks at a second image with visual traces; {SERVE}"
@@ -157,31 +156,4 @@ fn names(directory: &Path) -> Vec<String> {
         entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
     names.sort();
     names
-}
-
-/// The names of all tensors, from the index of the shards or the header of the only file; none if
-/// they cannot be read, which the loader reports.
-fn tensor_names(directory: &Path) -> Vec<String> {
-    let index = directory.join("model.safetensors.index.json");
-    let single = directory.join("model.safetensors");
-    let fields = if single.is_file() {
-        header(&single)
-    } else {
-        let text = std::fs::read(index).ok();
-        let index = text.and_then(|text| serde_json::from_slice::<Value>(&text).ok());
-        index.and_then(|mut index| index.get_mut("weight_map").map(Value::take))
-    };
-    let Some(Value::Object(fields)) = fields else { return Vec::new() };
-    fields.into_iter().map(|(name, _)| name).collect()
-}
-
-fn header(path: &Path) -> Option<Value> {
-    let mut file = File::open(path).ok()?;
-    let mut length = [0; 8];
-    file.read_exact(&mut length).ok()?;
-    let length = u64::from_le_bytes(length);
-    if length > HEADER_BYTES_MAX {
-        return None;
-    }
-    serde_json::from_reader(file.take(length)).ok()
 }
