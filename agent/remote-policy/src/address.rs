@@ -93,14 +93,16 @@ impl FromStr for Address {
             !has_user,
             "{forms}, got a user's name or password in it; a key is given by its own option"
         );
+        let port = match uri.port_u16() {
+            Some(port) => port,
+            None if uri.authority().is_some_and(|authority| authority.as_str() == host) => {
+                PORT_DEFAULT
+            }
+            None => bail!("{forms}, got {text:?}"),
+        };
         let path = uri.path_and_query().map_or("/", |path| path.as_str());
         ensure!(wire != Wire::Act || path != "/", "expected the path too, such as {text}/act");
-        Ok(Address {
-            wire,
-            host: host.to_owned(),
-            port: uri.port_u16().unwrap_or(PORT_DEFAULT),
-            path: path.to_owned(),
-        })
+        Ok(Address { wire, host: host.to_owned(), port, path: path.to_owned() })
     }
 }
 
@@ -129,6 +131,8 @@ mod tests {
         for (text, expected) in [
             ("grpc://host:1", "got \"grpc://host:1\""),
             ("openpi://", "got \"openpi://\""),
+            ("openpi://host:70000", "got \"openpi://host:70000\""),
+            ("openpi://host:x", "got \"openpi://host:x\""),
             ("https://host/act", "for an encrypted connection use a tunnel"),
             ("ws://host:8000", "which of the two does the server speak?"),
             ("openpi://me:secret@host", "a key is given by its own option"),

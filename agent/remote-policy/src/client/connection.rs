@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, bail};
 use decision::{EpisodeName, Image};
 
 use super::act;
@@ -22,7 +22,7 @@ pub struct Reply {
 }
 
 /// An observation of the agent.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Question {
     /// The camera image.
     pub image: Image,
@@ -94,14 +94,13 @@ impl Connection {
     }
 
     /// Sends an observation and waits for its answer.
-    pub async fn ask(&mut self, target: &Target, question: &Question) -> Result<Reply> {
-        let observation = observation(&target.profile, target.address.wire, question)?;
+    pub async fn ask(&mut self, target: &Target, observation: &Value<'_>) -> Result<Reply> {
         let wait = Duration::from_secs(target.profile.server.answer_secs_max);
         match self {
-            Connection::OpenPi(connection) => connection.ask(&observation, wait).await,
-            Connection::VlaEval(connection) => connection.ask(observation, wait).await,
+            Connection::OpenPi(connection) => connection.ask(observation, wait).await,
+            Connection::VlaEval(connection) => connection.ask(observation.clone(), wait).await,
             Connection::Act => {
-                act::ask(&target.address, target.key.as_deref(), &observation, wait).await
+                act::ask(&target.address, target.key.as_deref(), observation, wait).await
             }
         }
     }
@@ -115,7 +114,8 @@ impl Connection {
 }
 
 /// The fields that the profile names on this wire.
-fn observation(profile: &Profile, wire: Wire, question: &Question) -> Result<Value<'static>> {
+pub fn observation(target: &Target, question: &Question) -> Result<Value<'static>> {
+    let (profile, wire) = (&target.profile, target.address.wire);
     let array = |array: Array<'static>| match wire {
         Wire::OpenPi => array.into_value(openpi::KEYS),
         Wire::VlaEval => array.into_value(vla_eval::KEYS),
@@ -150,14 +150,6 @@ fn observation(profile: &Profile, wire: Wire, question: &Question) -> Result<Val
     if let Some(ask) = &question.ask {
         fields.push((extension::KEY.to_owned(), ask.value()));
     }
-    let mut names: Vec<&str> = fields.iter().map(|(name, _)| &**name).collect();
-    names.sort_unstable();
-    let twice = names.windows(2).find(|pair| pair[0] == pair[1]);
-    ensure!(
-        twice.is_none(),
-        "profile: expected every name once, got {} twice",
-        twice.map_or("", |pair| pair[0])
-    );
     Ok(map(fields))
 }
 

@@ -10,17 +10,17 @@ use decision::{EpisodeName, EpisodeToken, EpisodeWatch};
 use futures_util::future::try_join_all;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use super::connection::{Connection, Greeting, Question, Reply, Target};
+use super::connection::{self, Connection, Greeting, Question, Reply, Target};
 use crate::Wire;
 
-/// A server that is started again is waited for, for this long, at the start of an episode.
+/// Maximum wait at the start of an episode for a server that restarts.
 const RECONNECT_WAIT: Duration = Duration::from_secs(60);
 /// Time between two attempts.
 const RECONNECT_INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum number of connections per episode to a server without a state.
 const PARALLEL_MAX: usize = 8;
 /// Maximum number of connections per episode to a vla-eval server, one per candidate.
-pub const SESSIONS_MAX: usize = 64;
+const SESSIONS_MAX: usize = 64;
 
 /// The running episodes by their tokens.
 #[derive(Default)]
@@ -37,9 +37,9 @@ struct Running {
 pub struct Session {
     name: EpisodeName,
     connections: Vec<Connection>,
-    /// The last question's seed and its answers. A decision that is repeated because another
-    /// episode's failed must not reach the server twice.
-    last: Option<(u64, Vec<Reply>)>,
+    /// The last seed, question and answers. A decision that is retried because another episode's
+    /// failed must not reach the server twice.
+    last: Option<(u64, Question, Vec<Reply>)>,
     /// Why the episode cannot go on: the server has lost its state.
     failed: Option<String>,
 }
@@ -86,15 +86,16 @@ impl Session {
         if let Some(reason) = &self.failed {
             return Err(anyhow!("{reason}"));
         }
-        if let Some((last, replies)) = &self.last
-            && *last == seed
+        if let Some((last_seed, last, replies)) = &self.last
+            && *last_seed == seed
+            && last == question
             && replies.len() == count
         {
             return Ok(replies.clone());
         }
         match self.try_ask(target, greeting, question, count).await {
             Ok(replies) => {
-                self.last = Some((seed, replies.clone()));
+                self.last = Some((seed, question.clone(), replies.clone()));
                 Ok(replies)
             }
             Err(error) => {
@@ -113,14 +114,15 @@ impl Session {
         question: &Question,
         count: usize,
     ) -> Result<Vec<Reply>> {
+        let observation = &connection::observation(target, question)?;
         let wanted = connections_wanted(target.address.wire, count)?;
+        // Every session of a vla-eval server must see every observation of the episode.
+        let before = self.last.as_ref().map(|(_, _, replies)| replies.len());
+        ensure!(
+            target.address.wire != Wire::VlaEval || before.is_none_or(|before| before == count),
+            "expected as many candidates in every decision of an episode"
+        );
         while self.connections.len() < wanted {
-            // A later decision with more candidates would meet a session that has not seen the
-            // earlier observations.
-            ensure!(
-                self.last.is_none() || target.address.wire != Wire::VlaEval,
-                "expected as many candidates in every decision of an episode"
-            );
             let mut connection = reconnect(target, greeting).await?;
             connection.begin(&self.name).await?;
             self.connections.push(connection);
@@ -130,7 +132,7 @@ impl Session {
                 let share = (index..count).step_by(wanted).count();
                 let mut replies = Vec::with_capacity(share);
                 for _ in 0..share {
-                    replies.push(connection.ask(target, question).await?);
+                    replies.push(connection.ask(target, observation).await?);
                 }
                 anyhow::Ok(replies)
             },
@@ -145,8 +147,8 @@ impl Session {
     }
 }
 
-/// A vla-eval server keeps a state by connection: every candidate has its own, which sees every
-/// observation once. The others are asked again on the same connections.
+/// A vla-eval server keeps state per connection, so every candidate has its own connection, which
+/// sees every observation once. Other servers share at most [`PARALLEL_MAX`] connections.
 pub fn connections_wanted(wire: Wire, count: usize) -> Result<usize> {
     match wire {
         Wire::VlaEval => {

@@ -22,7 +22,7 @@ use crate::{Address, Profile, Wire};
 const THREADS: usize = 2;
 /// Time between two looks for episodes that are over.
 const END_INTERVAL: Duration = Duration::from_millis(500);
-/// Decisions with identical candidates before this is said.
+/// Consecutive decisions with identical candidates before a warning is logged.
 const IDENTICAL_DECISIONS: u32 = 3;
 /// Batches that may be asked at the same time: one per episode of a large run.
 const PARALLEL_CALLS: usize = 64;
@@ -120,6 +120,7 @@ impl RemotePolicy {
             announced.hidden_size.is_some()
                 && announced.confidence_size.is_some()
                 && announced.digest.is_some()
+                && announced.action_scale.is_some()
         })
     }
 
@@ -132,7 +133,7 @@ impl RemotePolicy {
             ensure!(
                 self.has_hidden(),
                 "strategy {strategy}: expected a policy that exposes hidden states and log-probabilities, but {place} \
-                 does not announce them; sample, first-well-formed, majority and medoid need none"
+                 does not announce all of digest, hidden_size, confidence_size and action_scale; sample, first-well-formed, majority and medoid need none"
             );
         }
         let Some(announced) = self.announcement() else {
@@ -183,6 +184,8 @@ impl Policy for RemotePolicy {
 
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
         let runtime = self.runtime.as_ref().context("the policy is closed")?;
+        // Their connections must not take places that new episodes need.
+        self.shared.episodes.end_finished().await;
         let asked: Vec<_> = requests
             .iter()
             .map(|request| {
@@ -267,7 +270,7 @@ impl Shared {
         {
             tracing::warn!(
                 "{}: in {decisions} decisions all {count} answers were identical: the server is deterministic, so \
-                 that there is nothing to choose from",
+                 there is nothing to choose from",
                 self.target.address
             );
         }
@@ -309,5 +312,5 @@ fn digest(target: &Target, greeting: &Greeting) -> Result<String> {
         .chain_update([0])
         .chain_update(&greeting.bytes)
         .finalize();
-    Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
+    Ok(format!("{digest:x}"))
 }

@@ -97,6 +97,13 @@ async fn open(address: &Address, key: Option<&str>) -> Result<WebSocketStream<Tc
         .max_frame_size(Some(FRAME_BYTES_MAX));
     match client_async_with_config(request, stream, Some(limits)).await {
         Ok((stream, _)) => Ok(stream),
+        // An `io::Error`, so that the start of an episode waits for a free place.
+        Err(SocketError::Http(response))
+            if response.status() == http::StatusCode::SERVICE_UNAVAILABLE =>
+        {
+            let kind = std::io::ErrorKind::ResourceBusy;
+            Err(std::io::Error::new(kind, "the server has no free place (503)").into())
+        }
         Err(SocketError::Http(response)) => bail!("{}", refusal(response.status(), key.is_some())),
         Err(error) => bail!("no WebSocket server: {}", printable(&error.to_string())),
     }
@@ -111,9 +118,10 @@ fn refusal(status: http::StatusCode, has_key: bool) -> String {
     }
 }
 
-/// Answers commands one after the other, and keeps at most one frame that came without a question.
+/// Answers commands one after the other. Keeps one thing that came without a question: a frame, or
+/// the reason why the connection ended.
 async fn serve(mut stream: WebSocketStream<TcpStream>, mut commands: mpsc::Receiver<Command>) {
-    let mut early: Option<Frame> = None;
+    let mut early: Option<Result<Frame>> = None;
     loop {
         tokio::select! {
             command = commands.recv() => {
@@ -122,11 +130,7 @@ async fn serve(mut stream: WebSocketStream<TcpStream>, mut commands: mpsc::Recei
                     break;
                 }
             }
-            frame = next(&mut stream) => match frame {
-                Ok(frame) if early.is_none() => early = Some(frame),
-                // The next command finds the channel closed.
-                _ => break,
-            }
+            frame = next(&mut stream), if early.is_none() => early = Some(frame),
         }
     }
     let _ = timeout(CONNECT_WAIT, stream.close(None)).await;
@@ -137,7 +141,7 @@ async fn serve(mut stream: WebSocketStream<TcpStream>, mut commands: mpsc::Recei
 async fn obey(
     stream: &mut WebSocketStream<TcpStream>,
     command: Command,
-    early: &mut Option<Frame>,
+    early: &mut Option<Result<Frame>>,
 ) -> bool {
     let Command { frame, answer } = command;
     let sent = match frame {
@@ -145,10 +149,10 @@ async fn obey(
         None => Ok(()),
     };
     let Some(mut answer) = answer else { return sent.is_ok() };
-    let answered = match (sent, early.take()) {
-        (Err(error), _) => Err(error),
-        (Ok(()), Some(frame)) => Ok(Answered { frame, is_early: true }),
-        (Ok(()), None) => tokio::select! {
+    let answered = match (early.take(), sent) {
+        (Some(Err(error)), _) | (None, Err(error)) => Err(error),
+        (Some(Ok(frame)), _) => Ok(Answered { frame, is_early: true }),
+        (None, Ok(())) => tokio::select! {
             frame = next(stream) => frame.map(|frame| Answered { frame, is_early: false }),
             () = answer.closed() => return false,
         },

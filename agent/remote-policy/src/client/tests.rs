@@ -37,9 +37,18 @@ pub fn propose(
     candidates: usize,
     seed: u64,
 ) -> anyhow::Result<Proposal> {
-    let image = image();
+    propose_seeing(&image(), policy, episode, (candidates, seed))
+}
+
+/// The same for another image.
+pub fn propose_seeing(
+    image: &Image,
+    policy: &RemotePolicy,
+    episode: &EpisodeToken,
+    (candidates, seed): (usize, u64),
+) -> anyhow::Result<Proposal> {
     let request = ProposalRequest {
-        image: &image,
+        image,
         state: &STATE,
         instruction: "stack the cubes",
         candidates,

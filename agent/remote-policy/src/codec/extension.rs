@@ -106,7 +106,11 @@ impl Announcement {
             Ok(Announcement {
                 candidates_max: candidates_max.min(CANDIDATES_MAX),
                 digest: text(fields, "digest", NAME_BYTES_MAX)?,
-                is_greedy: matches!(fields.get("greedy"), Some(Value::Bool(true))),
+                is_greedy: match optional(fields, "greedy") {
+                    None => false,
+                    Some(Value::Bool(greedy)) => *greedy,
+                    Some(other) => bail!("greedy: expected a boolean, got {}", other.kind()),
+                },
                 image_size: image_size(fields)?,
                 hidden_size: count(fields, "hidden_size")?,
                 confidence_size: count(fields, "confidence_size")?,
@@ -158,7 +162,8 @@ impl Ask {
                 "candidates: expected 1 to {CANDIDATES_MAX}, got {}",
                 candidates.unwrap_or_default()
             );
-            let seed = fields.get("seed").map(Value::as_integer).transpose().context("seed")?;
+            let seed =
+                optional(fields, "seed").map(Value::as_integer).transpose().context("seed")?;
             Ok(Ask {
                 candidates,
                 temperature,
@@ -188,7 +193,7 @@ impl Answer {
     }
 
     fn of(fields: &Value<'_>) -> Result<Answer> {
-        let list = match fields.get("candidates") {
+        let list = match optional(fields, "candidates") {
             None => &[][..],
             Some(Value::List(list)) => list,
             Some(other) => bail!("candidates: expected a list, got {}", other.kind()),
@@ -202,10 +207,8 @@ impl Answer {
             AnswerCandidate::read(value).with_context(|| format!("candidate {index}"))
         };
         let candidates = list.iter().enumerate().map(read).collect::<Result<Vec<_>>>()?;
-        let chosen = match fields.get("chosen") {
-            None | Some(Value::Nil) => None,
-            Some(index) => Some(index.as_integer().context("chosen")?),
-        };
+        let chosen: Option<usize> =
+            optional(fields, "chosen").map(Value::as_integer).transpose().context("chosen")?;
         ensure!(
             chosen.is_none_or(|index| index < candidates.len()),
             "chosen: expected the index of one of {count_got} candidates, got {chosen:?}"
@@ -228,8 +231,8 @@ impl AnswerCandidate {
     fn read(fields: &Value<'_>) -> Result<AnswerCandidate> {
         fields.entries()?;
         let malformed = text(fields, "malformed", REASONING_BYTES_MAX)?;
-        let actions = match fields.get("actions") {
-            None | Some(Value::Nil) => Vec::new(),
+        let actions = match optional(fields, "actions") {
+            None => Vec::new(),
             Some(value) => actions::actions(value)?,
         };
         ensure!(

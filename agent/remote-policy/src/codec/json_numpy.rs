@@ -48,6 +48,7 @@ pub fn encode(value: &Value<'_>) -> Result<String> {
 }
 
 /// Wraps an encoded request in the second form.
+#[cfg(test)]
 pub fn encode_twice(body: &str) -> String {
     serde_json::json!({ "encoded": body }).to_string()
 }

@@ -1,5 +1,5 @@
-//! Bytes of the three wires, strict and bounded: a decoder never allocates more than a small
-//! multiple of the bytes that came, and names what was expected and what came.
+//! Bytes of the three wires, strict and bounded: a decoder allocates in proportion to the bytes
+//! received, never to an announced length, and names what it expected and what it received.
 
 mod actions;
 mod array;

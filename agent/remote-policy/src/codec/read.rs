@@ -120,7 +120,8 @@ impl<'a> Reader<'a> {
 
     fn map(&mut self, length: usize, depth: usize) -> Result<Value<'a>> {
         self.check_length(length, depth)?;
-        let mut entries = Vec::with_capacity(length);
+        // Not reserved: every level of nested maps may announce as many entries as there are bytes.
+        let mut entries = Vec::new();
         for _ in 0..length {
             entries.push((self.key()?, self.value(depth + 1)?));
         }

@@ -7,7 +7,7 @@ use sha2::{Digest, Sha256};
 
 use super::{Camera, Gripper, ImageInput, Profile, Rotation, StateValue};
 use crate::Wire;
-use crate::codec::extension::Announcement;
+use crate::codec::extension::{self, Announcement};
 use crate::codec::{DIMENSIONS_MAX, IMAGE_SIDE_MAX, STEPS_MAX};
 
 /// Names and contents of the profiles that come with the program.
@@ -55,7 +55,7 @@ impl Profile {
     /// Identity of the mapping, in hexadecimal.
     pub fn digest(&self) -> Result<String> {
         let text = serde_json::to_string(self).context("profile")?;
-        Ok(Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect())
+        Ok(format!("{:x}", Sha256::digest(text)))
     }
 
     /// Checks that the profile has what a wire needs.
@@ -69,6 +69,27 @@ impl Profile {
             self.prompt.names.on(wire).is_some(),
             "prompt: expected a name on the wire {wire}, got none; add one to the profile"
         );
+        self.check_names(wire)
+    }
+
+    /// Refuses two values under one name.
+    fn check_names(&self, wire: Wire) -> Result<()> {
+        let images = self.images.iter().filter_map(|image| image.names.on(wire));
+        let state = self.state.iter().filter_map(|state| state.names.on(wire));
+        let fields = state.chain(self.prompt.names.on(wire)).chain([extension::KEY]);
+        // vla-eval has its images in a map of their own.
+        let maps: Vec<Vec<&str>> = match wire {
+            Wire::VlaEval => vec![images.collect(), fields.chain(["images"]).collect()],
+            Wire::OpenPi => vec![images.chain(fields).collect()],
+            Wire::Act => vec![images.chain(fields).chain(["unnorm_key"]).collect()],
+        };
+        for mut names in maps {
+            names.sort_unstable();
+            let twice = names.windows(2).find(|pair| pair[0] == pair[1]);
+            if let Some(pair) = twice {
+                bail!("expected every name once on the wire {wire}, got {} twice", pair[0]);
+            }
+        }
         Ok(())
     }
 
@@ -97,6 +118,14 @@ impl Profile {
             values.len() == 1 || !values.contains(&StateValue::All),
             "state.values: expected \"all\" to stand alone, got {} values",
             values.len()
+        );
+        let has_fingers = values
+            .iter()
+            .any(|value| matches!(value, StateValue::Finger | StateValue::FingerNegative));
+        let opening = self.state.as_ref().map_or(0.0, |state| state.finger_open_metres);
+        ensure!(
+            !has_fingers || (opening.is_finite() && opening > 0.0),
+            "state.finger_open_metres: expected a positive number for finger and finger-negative, got {opening}"
         );
         let secs = self.server.answer_secs_max;
         ensure!(

@@ -52,7 +52,7 @@ pub struct Server {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Answers {
-    /// It samples: every answer to the same observation is another one.
+    /// It samples: repeated answers to one observation differ.
     #[default]
     Sampled,
     /// It gives the most likely action.

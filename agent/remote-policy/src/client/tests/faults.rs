@@ -51,8 +51,7 @@ fn a_frame_that_nothing_asked_for_is_a_fault() {
     // later one: each question brings two more.
     let refusal = (1..50).map(|seed| propose(&policy, &running, 1, seed)).find_map(Result::err);
     let refusal = format!("{:#}", refusal.expect("a fault"));
-    let expected = ["a frame that nothing asked for", "closed the connection"];
-    assert!(expected.iter().any(|words| refusal.contains(words)), "{refusal}");
+    assert!(refusal.contains("a frame that nothing asked for"), "{refusal}");
 }
 
 #[test]

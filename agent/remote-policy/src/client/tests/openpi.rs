@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use decision::{Policy, Setting, Strategy};
+use decision::{Image, Policy, Setting, Strategy};
 
 use super::super::episodes::Episodes;
 use super::scripted::{Script, Scripted, frame, metadata, result, result_with};
-use super::{connect, episode, motions, propose, words};
+use super::{connect, episode, image, motions, propose, propose_seeing, words};
 use crate::codec::extension::{Announcement, Answer, AnswerCandidate, Ask};
 use crate::codec::{Array, Value, decode, openpi};
 
@@ -59,6 +59,10 @@ fn an_episode_has_its_own_connections_until_it_ends() {
     // The same decision again does not reach the server.
     propose(&policy, &one, 1, 2).expect("a proposal");
     assert_eq!(server.received.lock().expect("not poisoned").len(), received.len());
+    // Another observation does, even with the same seed.
+    let other = Image { pixels: vec![9; 224 * 224 * 3].into(), ..image() };
+    propose_seeing(&other, &policy, &one, (1, 2)).expect("a proposal");
+    assert_eq!(server.received.lock().expect("not poisoned").len(), received.len() + 1);
 }
 
 #[test]

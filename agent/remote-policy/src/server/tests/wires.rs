@@ -152,6 +152,22 @@ async fn a_vla_eval_client_that_greets_late_is_understood_and_errors_keep_the_co
 }
 
 #[tokio::test]
+async fn a_wrong_start_of_an_episode_is_answered_with_its_first_observation() {
+    let server = Server::start(1).await;
+    let mut client = server.connect().await;
+    client.send(&hello()).await;
+    answer(&mut client).await;
+    let task = Value::map([("name", Value::text(""))]);
+    client.send(&message("episode_start", Value::map([("task", task)]), 2)).await;
+    // vla-eval's client takes the next frame as the answer to its observation.
+    for (observation, expected) in [(3, "error"), (4, "action")] {
+        client.send(&message("observation", seen(1), observation)).await;
+        let (kind, sequence, _) = answer(&mut client).await;
+        assert_eq!((&*kind, sequence), (expected, observation));
+    }
+}
+
+#[tokio::test]
 async fn vla_eval_gets_a_chunk_one_action_at_a_time() {
     let server = Server::start(3).await;
     let mut client = server.connect().await;
