@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
 
 from actions import Statistics
 from network import DecoderConfig, Network, NetworkConfig, TowerConfig
@@ -41,21 +42,30 @@ def write(
     config = config_json(network.config, statistics, dtype)
     replace(directory / "config.json", json.dumps(config, indent=2) + "\n")
     tokenizer.save(directory / "tokenizer.json")
+    write_weights(directory / "model.safetensors", network, dtype)
+
+
+def write_weights(path: Path, module: nn.Module, dtype: torch.dtype) -> None:
+    """Writes all weights of a module, atomically."""
     weights = {
-        name: tensor.detach().to(dtype).contiguous()
-        for name, tensor in network.state_dict().items()
+        name: tensor.detach().to(dtype).contiguous() for name, tensor in module.state_dict().items()
     }
-    partial = directory / "model.safetensors.partial"
+    partial = path.with_name(path.name + ".partial")
     save_file(weights, partial, metadata={"format": "pt"})
-    partial.replace(directory / "model.safetensors")
+    partial.replace(path)
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """Reads weights in float32, whatever their type on disk."""
+    return {name: tensor.float() for name, tensor in load_file(path).items()}
 
 
 def read(directory: Path) -> Checkpoint:
-    """Loads a checkpoint; the weights are float32, whatever their type on disk."""
+    """Loads a checkpoint; the weights are float32."""
     config = json.loads((directory / "config.json").read_text(encoding="utf-8"))
-    weights = load_file(directory / "model.safetensors")
+    weights = read_weights(directory / "model.safetensors")
     network = Network(network_config(config, dead_blocks(config, weights)))
-    network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})
+    network.load_state_dict(weights)
     action = config["norm_stats"][config["unnorm_key"]]["action"]
     statistics = Statistics.from_json(action)
     return Checkpoint(network.eval(), Tokenizer.load(directory / "tokenizer.json"), statistics)
@@ -117,7 +127,7 @@ def network_config(config: dict[str, Any], dead: int) -> NetworkConfig:
     )
 
 
-def dead_blocks(config: dict[str, Any], weights: dict[str, torch.Tensor]) -> int:
+def dead_blocks(config: dict[str, Any], weights: dict[str, Tensor]) -> int:
     prefix = "vision_backbone.featurizer.blocks."
     present = {key[len(prefix) :].split(".")[0] for key in weights if key.startswith(prefix)}
     return len(present) - (int(config["vision_config"]["depth"]) - 1)

@@ -43,9 +43,8 @@ class Frames:
         return len(self.image)
 
     def draw(self, count: int, seed: int, step: int) -> NDArray[np.int64]:
-        """Indices of a batch: a function of seed and step only, so that runs can be resumed."""
-        generator = np.random.default_rng([seed, step])
-        return np.searchsorted(np.cumsum(self.weight), generator.random(count)).astype(np.int64)
+        """Indices of a batch."""
+        return draw(self.weight, count, seed, step)
 
     def batch(self, indices: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
         """(batch, 128, 128, 3), (batch, prompt), (batch, completion)."""
@@ -100,6 +99,14 @@ def weigh(demonstrations: Sequence[Demonstration]) -> NDArray[np.float64]:
         weight[names == name] /= weight[names == name].sum()
     shares: NDArray[np.float64] = weight / weight.sum()
     return shares
+
+
+def draw(weight: NDArray[np.float64], count: int, seed: int, step: int) -> NDArray[np.int64]:
+    """Indices of a batch: a function of seed and step only, so that runs can be resumed."""
+    generator = np.random.default_rng([seed, step])
+    drawn = np.searchsorted(np.cumsum(weight), generator.random(count)).astype(np.int64)
+    # Rounding may leave the last sum a little below 1.
+    return np.minimum(drawn, len(weight) - 1)
 
 
 def subtask(text: str) -> str:

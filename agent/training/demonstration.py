@@ -18,6 +18,8 @@ class Demonstration:
     seed: int
     # (T, 128, 128, 3)
     image: NDArray[np.uint8]
+    # (T, 8): x y z (m), roll pitch yaw (rad), 0, gripper opening 0..1
+    state: NDArray[np.float32]
     # (T, 7), the noise-free label in the environment's convention
     expert_action: NDArray[np.float32]
     # T texts, from " TASK:" to " ACTION:"
@@ -31,6 +33,7 @@ class Demonstration:
                 instruction=str(arrays["instruction"]),
                 seed=int(arrays["seed"]),
                 image=arrays["image"],
+                state=arrays["state"],
                 expert_action=arrays["expert_action"],
                 # The text in the file ends before the action; the model's completion starts with a
                 # space and includes the action.

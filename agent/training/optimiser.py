@@ -17,6 +17,7 @@ from torch import Tensor, nn
 # Coefficients of the quintic iteration, from Jordan et al.
 QUINTIC = (3.4445, -4.7750, 2.0315)
 ADAM_STEP_SIZE = 0.2
+WARMUP_STEPS = 60
 
 
 class Muon(torch.optim.Optimizer):
@@ -94,3 +95,11 @@ def build(
             outer, lr=adam_learning_rate, betas=(0.9, 0.98), weight_decay=0.0, fused=True
         ),
     ]
+
+
+def rate_factor(step: int, share: float) -> float:
+    """Factor of all learning rates at a step and at the spent share, 0 to 1, of the budget.
+
+    A short warmup, 1 for the first quarter of the budget, then linear to 0.
+    """
+    return min(1.0, (step + 1) / WARMUP_STEPS) * min(1.0, (1.0 - share) / 0.75)

@@ -33,7 +33,6 @@ from evaluate import measure_held_out
 from network import DecoderConfig, Network, NetworkConfig, TowerConfig
 from tokenizer import Tokenizer
 
-WARMUP_STEPS = 60
 GRADIENT_NORM_MAX = 1.0
 
 # Image, prompt, completion as context, completion as target.
@@ -169,10 +168,10 @@ class Trainer:
         return self.progress.seconds / (60.0 * self.options.minutes)
 
     def step(self, share: float) -> float:
-        warm = min(1.0, (self.progress.step + 1) / WARMUP_STEPS)
+        factor = optimiser.rate_factor(self.progress.step, share)
         groups = [group for each in self.optimisers for group in each.param_groups]
         for group, rate in zip(groups, self.rates, strict=True):
-            group["lr"] = rate * warm * decay(share)
+            group["lr"] = rate * factor
         options = self.options
         image, prompt, completion = self.frames.batch(
             self.frames.draw(options.batch, options.seed, self.progress.step)
@@ -271,11 +270,6 @@ def loss_function(
         loss, dynamic=False
     )
     return compiled
-
-
-def decay(share: float) -> float:
-    """Learning rate factor: 1 for the first quarter of the budget, then linear to 0."""
-    return min(1.0, (1.0 - share) / 0.75)
 
 
 def parse(arguments: list[str]) -> Options:

@@ -17,6 +17,7 @@ mod task;
 
 // Proposals of a policy.
 mod candidate;
+mod fit;
 mod policy;
 mod reasoning;
 
@@ -39,10 +40,11 @@ pub use candidate::{Candidate, CandidateAction, Parsed, Proposal, ProposalReques
 pub use context::{EpisodeContext, step_seed};
 pub use decider::{Decider, Decision, DecisionFault, DecisionRequest};
 pub use episode::{EpisodeName, EpisodeToken, EpisodeWatch};
+pub use fit::fit_image;
 pub use policy::{Policy, PolicyInfo};
 pub use protocol::message::{Image, Observation};
 pub use reasoning::{Malformed, Reasoning, TAGS, Unread, VisibleObject, last_tag};
-pub use rotation::{quaternion, rotation_vector};
+pub use rotation::{quaternion, roll_pitch_yaw, rotation_vector};
 pub use scorer::{Scorer, ScoringRequest, probability};
 pub use seeds::{episode_hash, episode_name, sampling_seed};
 pub use setting::Setting;

@@ -3,7 +3,7 @@
 use anyhow::Result;
 use async_trait::async_trait;
 
-use crate::{ActionSpace, Candidate, Proposal, ProposalRequest};
+use crate::{ActionSpace, Candidate, Proposal, ProposalRequest, Setting};
 
 /// What other components need to know about a policy.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,6 +31,12 @@ pub trait Policy: Send + Sync {
 
     /// Samples candidates for all requests; returns one proposal per request, in the same order.
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>>;
+
+    /// Refuses a setting that this policy cannot do, and says why. Every setting that is used is
+    /// checked before the first request with it.
+    fn check(&self, _setting: &Setting) -> Result<()> {
+        Ok(())
+    }
 
     /// The text of a candidate, if the policy writes one.
     fn text(&self, _candidate: &Candidate) -> Option<String> {

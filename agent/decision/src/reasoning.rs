@@ -5,6 +5,8 @@ mod partial;
 
 use std::fmt;
 
+use serde::{Deserialize, Serialize};
+
 pub use partial::Unread;
 
 /// ECoT's tags in order. `ACTION:` ends the text; action tokens follow it.
@@ -24,7 +26,8 @@ pub const TAGS: [&str; 9] = [
 const COORDINATE_MAX: u16 = 256;
 
 /// The reasoning of a policy before its action.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Reasoning {
     /// The whole task as text.
     pub task: String,
@@ -44,12 +47,15 @@ pub struct Reasoning {
     /// Pixel coordinates (x, y) in an image of 256 x 256 pixels: the gripper's position and, in
     /// ECoT, its future positions.
     pub gripper_position: Vec<[u16; 2]>,
-    /// The sections that were not read, or not completely. Empty for a text in ECoT's form.
+    /// The sections that were not read, or not completely. Empty for a text in ECoT's form. Records
+    /// hold them as text.
+    #[serde(skip)]
     pub unread: Vec<Unread>,
 }
 
 /// An object and its bounding box in an image of 256 x 256 pixels.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct VisibleObject {
     /// The name of the object in the text.
     pub name: String,

@@ -10,6 +10,19 @@ pub fn rotation_vector(roll: f64, pitch: f64, yaw: f64) -> [f64; 3] {
     axis.map(|number| number * factor)
 }
 
+/// Roll, pitch and yaw of a rotation vector: the inverse of [`rotation_vector`] for pitches of at
+/// most a quarter turn.
+pub fn roll_pitch_yaw(vector: [f64; 3]) -> [f64; 3] {
+    let angle = vector.iter().map(|number| number * number).sum::<f64>().sqrt();
+    // Near zero, sin(angle / 2) / angle approaches 1 / 2.
+    let factor = if angle < 1e-9 { 0.5 } else { (angle / 2.0).sin() / angle };
+    let ([x, y, z], w) = (vector.map(|number| number * factor), (angle / 2.0).cos());
+    let roll = (2.0 * (w * x + y * z)).atan2(1.0 - 2.0 * (x * x + y * y));
+    let pitch = (2.0 * (w * y - x * z)).clamp(-1.0, 1.0).asin();
+    let yaw = (2.0 * (w * z + x * y)).atan2(1.0 - 2.0 * (y * y + z * z));
+    [roll, pitch, yaw]
+}
+
 /// The unit quaternion (w, x, y, z) of the same rotation; w is not negative.
 pub fn quaternion(roll: f64, pitch: f64, yaw: f64) -> [f64; 4] {
     let (sr, cr) = (roll / 2.0).sin_cos();
@@ -30,6 +43,18 @@ mod tests {
     use std::f64::consts::FRAC_PI_2;
 
     use super::*;
+
+    #[test]
+    fn angles_and_vectors_are_inverse() {
+        for angles in [[0.0; 3], [0.1, -0.2, 0.3], [-2.0, 1.2, 3.0], [1e-10, 0.0, -1e-10]] {
+            let [roll, pitch, yaw] = angles;
+            for (got, expected) in
+                roll_pitch_yaw(rotation_vector(roll, pitch, yaw)).iter().zip(angles)
+            {
+                assert!((got - expected).abs() < 1e-12, "{got}, expected {expected}");
+            }
+        }
+    }
 
     #[test]
     fn a_turn_about_one_axis_is_its_angle() {

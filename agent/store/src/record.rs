@@ -6,7 +6,7 @@
 mod file;
 
 use anyhow::{Result, ensure};
-use decision::{Action, ActionChunk};
+use decision::{Action, ActionChunk, Reasoning};
 use half::f16;
 use protocol::Statistics;
 use serde::{Deserialize, Serialize};
@@ -92,7 +92,8 @@ pub struct DecisionRecord {
     pub batch_size: u32,
 }
 
-/// One sampled candidate. Its text is decoded from the tokens with the policy's tokenizer.
+/// One sampled candidate. Its text is decoded from the tokens with the policy's tokenizer, or kept
+/// in `said` if the tokens are not those of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CandidateRecord {
@@ -116,6 +117,22 @@ pub struct CandidateRecord {
     /// for the executed candidate.
     #[serde(with = "serde_bytes")]
     pub hidden: Option<Vec<u8>>,
+    /// What cannot be decoded from the tokens; absent in every record of a checkpoint.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub said: Option<Said>,
+}
+
+/// What a policy server, or the backbone that reads its candidates, says of a well-formed candidate.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Said {
+    /// Empty for a policy that acts without reasoning.
+    pub reasoning: Reasoning,
+    /// Token ids of the action's bins; empty if the policy has none.
+    pub action_tokens: Vec<u32>,
+    /// Log-probability of each section of the reasoning and of each dimension of the action; empty
+    /// if they are not known.
+    pub confidence: Vec<f32>,
 }
 
 impl DecisionRecord {
@@ -182,6 +199,7 @@ pub(crate) mod tests {
             log_probability: -3.5,
             log_probabilities: vec![-1.0, -2.0, -0.5],
             hidden: Some(hidden_to_bytes(&[0.5, -2.0])),
+            said: None,
         };
         let malformed = CandidateRecord {
             actions: None,

@@ -11,7 +11,8 @@
 //! Weights are immutable; caches are passed as values. The result for a request does not depend on
 //! the other requests of the batch.
 
-// The checkpoint as a policy, and what it is compared with.
+// The checkpoint as a policy or as a verifier's backbone, and what it is compared with.
+mod backbone;
 mod parity;
 mod policy;
 
@@ -25,6 +26,7 @@ mod network;
 // Token generation: the decode loop, sampling, timing.
 mod generate;
 
+pub use backbone::ReadPolicy;
 pub use checkpoint::completion::CompletionParser;
 pub use checkpoint::options::{LoadOptions, ReasoningMode};
 pub use checkpoint::weights::Loaded;

@@ -9,7 +9,7 @@ use candle_core::{Device, Tensor};
 use decision::{Candidate, Image, Policy, PolicyInfo, Proposal, ProposalRequest};
 
 use crate::checkpoint::completion::CompletionParser;
-use crate::checkpoint::config::{Config, TowerConfig};
+use crate::checkpoint::config::{ACTION_LENGTH, Config, TowerConfig};
 use crate::checkpoint::digest_cache::DigestCache;
 use crate::checkpoint::identity::{Fingerprint, used_tensors};
 use crate::checkpoint::options::LoadOptions;
@@ -147,6 +147,17 @@ impl Vla {
 
     /// Samples candidates for all requests in one batch. Blocks the calling thread.
     pub fn propose_now(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
+        let given = vec![[].as_slice(); requests.len()];
+        self.complete(requests, &given)
+    }
+
+    /// The candidates of all requests. The actions of a request's candidates may be given; then the
+    /// network chooses only what comes before them.
+    pub(crate) fn complete(
+        &self,
+        requests: &[ProposalRequest<'_>],
+        given: &[&[[u32; ACTION_LENGTH]]],
+    ) -> Result<Vec<Proposal>> {
         if requests.is_empty() {
             return Ok(Vec::new());
         }
@@ -155,14 +166,15 @@ impl Vla {
         let images = self.images(requests.iter().map(|request| request.image));
         let sessions: Vec<Continuation<'_>> = requests
             .iter()
-            .zip(&prompts)
-            .zip(&images)
-            .map(|((request, ids), image)| Continuation {
+            .zip(given)
+            .zip(prompts.iter().zip(&images))
+            .map(|((request, actions), (ids, image))| Continuation {
                 context: Context { image, ids },
                 candidates: request.candidates,
                 temperature: request.temperature,
                 seed: request.seed,
                 tokens_max: self.tokens_max(ids.len()),
+                actions,
             })
             .collect();
         let limits = Limits {

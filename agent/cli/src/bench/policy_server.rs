@@ -13,7 +13,7 @@ use futures_util::{SinkExt, StreamExt};
 use image::{ImageFormat, RgbImage};
 use remote_policy::codec::{Array, ImageForm, KeyForm, Value, decode, encode, image_value};
 use remote_policy::server::{
-    ActionForm, AgentOptions, ObservationKeys, ServedAgent, ServerOptions, fit, serve,
+    ActionForm, AgentOptions, ObservationKeys, ServedAgent, ServerOptions, serve,
 };
 use serde::Serialize;
 use tokio::net::{TcpListener, TcpStream};
@@ -153,7 +153,7 @@ impl PolicyServerBench<'_> {
         observation: &Observation,
         seed: u64,
     ) -> Result<(f64, Vec<f32>)> {
-        let image = fit(observation.image.clone(), self.policy.info().image_size)?;
+        let image = decision::fit_image(observation.image.clone(), self.policy.info().image_size)?;
         let observation = Observation { image, ..observation.clone() };
         let begun = Instant::now();
         let instruction = observation.instruction.clone();

@@ -153,7 +153,7 @@ impl EpisodesArguments {
         let Ready { policy, checkpoint, settings, verifier, server } =
             self.ready(&request, host)?;
         let sessions = self.sessions_that_fit(checkpoint.as_deref(), &settings)?;
-        let digest = policy.info().digest.clone();
+        let (digest, said) = (policy.info().digest.clone(), server.is_some());
         // Opened now, so that a label store that cannot be used fails before any episode runs.
         LabelStore::open(&self.labels).map(drop)?;
         let runtime = Runtime::new().context("cannot start the async runtime")?;
@@ -193,7 +193,7 @@ impl EpisodesArguments {
             scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
             follow_verifier: self.follow_verifier.clone().map(|name| (name, load_scorer(digest))),
             sessions: usize::from(sessions),
-            record: RecordOptions { all_hidden: self.all_hidden, video: self.video },
+            record: RecordOptions { all_hidden: self.all_hidden, video: self.video, said },
             versions: build_info::record_versions(),
             is_quiet: request.output.is_quiet,
         };

@@ -15,6 +15,7 @@ mod loading;
 mod names;
 mod policy;
 mod policy_server;
+mod recorded_policy;
 mod report;
 mod selection;
 mod serve_policy;

@@ -13,12 +13,18 @@ use runtime::servers::{Host, data_folder};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use verifier::Verifier;
-use vla::{CompletionParser, DeviceName, LoadOptions, Loading, ReasoningMode, Vla, WeightFormat};
+use vla::{
+    CompletionParser, DeviceName, LoadOptions, Loading, ReadPolicy, ReasoningMode, Vla,
+    WeightFormat,
+};
 
 use super::WrongUsage;
 use super::loading::LoadingProgress;
 use super::policy_server::ServerArguments;
 use crate::files::{self, VERIFIER_FILE};
+
+/// The value of `--backbone` for the policy that comes with the program.
+const BACKBONE_INCLUDED: &str = "included";
 
 /// Which policy, and what it runs on. The help's heading stays in force after it, so it is the last field of a command.
 #[derive(Debug, Clone, Default, Args)]
@@ -31,6 +37,10 @@ pub struct PolicyArguments {
     pub device: DeviceName,
     #[command(flatten)]
     pub server: ServerArguments,
+    /// Checkpoint that reads the candidates of a policy server for the verifier, if the server exposes no hidden states:
+    /// a folder, or `included` for the policy that comes with rever
+    #[arg(long, value_name = "FOLDER")]
+    pub backbone: Option<PathBuf>,
     /// Bits of the decoder's weights in memory, on a CPU; 8bit halves their memory, makes large checkpoints faster, and
     /// changes some tokens
     #[arg(long, value_enum, default_value_t, value_name = "BITS")]
@@ -95,7 +105,7 @@ pub struct LoadedPolicy {
     pub checkpoint: Option<Arc<Vla>>,
     /// The checkpoint's folder, which may hold a verifier.
     pub folder: Option<PathBuf>,
-    /// The same policy, if it is a policy server.
+    /// The policy server, if the policy is one.
     pub server: Option<Arc<RemotePolicy>>,
     /// The name to show: a folder or an address.
     pub name: String,
@@ -123,19 +133,51 @@ impl PolicyArguments {
             ))
             .into());
         }
-        self.server.connect(&address, host).map(Some)
+        let connected = self.server.connect(&address, host)?;
+        self.with_backbone(connected, host).map(Some)
+    }
+
+    /// The policy server with the backbone that reads its candidates, if one is given.
+    fn with_backbone(&self, connected: LoadedPolicy, host: &Host) -> Result<LoadedPolicy> {
+        let Some(backbone) = &self.backbone else { return Ok(connected) };
+        let named = Some(backbone).filter(|name| name.as_os_str() != BACKBONE_INCLUDED);
+        let folder = files::policy_folder(named, host)?;
+        ensure_folder(&folder, "--backbone")?;
+        let backbone = Arc::new(self.load_checkpoint(&folder, &LoadOptions::default(), host)?);
+        let policy = ReadPolicy::new(connected.policy, backbone).map_err(wrong_usage)?;
+        Ok(LoadedPolicy { policy: Arc::new(policy), ..connected })
     }
 
     /// The arguments of this policy for a further command, with a space before them.
     pub fn words(&self) -> String {
-        self.source.words() + &self.server.words()
+        let backbone = self.backbone.iter();
+        let backbone: String =
+            backbone.map(|name| format!(" --backbone {}", name.display())).collect();
+        self.source.words() + &self.server.words() + &backbone
     }
 
     /// Loads the checkpoint in a folder that [`PolicySource`] has chosen.
     pub fn load_folder(&self, folder: PathBuf, host: &Host) -> Result<LoadedPolicy> {
         self.server.ensure_unused()?;
-        ensure_folder(&folder)?;
+        if self.backbone.is_some() {
+            return Err(WrongUsage(
+                "--backbone: expected a policy server, got a checkpoint, which has hidden states of its own".to_owned(),
+            )
+            .into());
+        }
+        ensure_folder(&folder, "--policy")?;
         let options = self.source.checkpoint.options();
+        let policy = Arc::new(self.load_checkpoint(&folder, &options, host)?);
+        Ok(LoadedPolicy {
+            policy: Arc::clone(&policy) as Arc<dyn Policy>,
+            checkpoint: Some(policy),
+            server: None,
+            name: folder.display().to_string(),
+            folder: Some(folder),
+        })
+    }
+
+    fn load_checkpoint(&self, folder: &Path, options: &LoadOptions, host: &Host) -> Result<Vla> {
         let progress = LoadingProgress::new(folder.display().to_string());
         let digests = data_folder(host).map(|data| data.join("digests"));
         let loading = Loading {
@@ -144,16 +186,9 @@ impl PolicyArguments {
             digests: digests.as_deref(),
             report: &|loaded| progress.report(loaded),
         };
-        let policy = Vla::load_with(&folder, &options, &loading).map_err(wrong_usage)?;
+        let policy = Vla::load_with(folder, options, &loading).map_err(wrong_usage)?;
         progress.finish();
-        let policy = Arc::new(policy);
-        Ok(LoadedPolicy {
-            policy: Arc::clone(&policy) as Arc<dyn Policy>,
-            checkpoint: Some(policy),
-            server: None,
-            name: folder.display().to_string(),
-            folder: Some(folder),
-        })
+        Ok(policy)
     }
 }
 
@@ -187,7 +222,7 @@ impl PolicySource {
             .into());
         }
         let folder = files::policy_folder(self.policy.as_ref(), host)?;
-        ensure_folder(&folder)?;
+        ensure_folder(&folder, "--policy")?;
         Ok(folder)
     }
 
@@ -286,7 +321,7 @@ fn gigabytes(text: &str) -> Result<f64, String> {
     number.ok_or_else(|| format!("expected a number of gigabytes above 0, got {text}"))
 }
 
-fn ensure_folder(folder: &Path) -> Result<()> {
+fn ensure_folder(folder: &Path, option: &str) -> Result<()> {
     if folder.is_dir() {
         return Ok(());
     }
@@ -294,12 +329,12 @@ fn ensure_folder(folder: &Path) -> Result<()> {
     let download = match name.split('/').collect::<Vec<_>>().as_slice() {
         // A name on the Hub.
         [owner, name] if !owner.is_empty() && !owner.starts_with('.') => {
-            format!("`hf download {owner}/{name} --local-dir {name}`, then --policy {name}")
+            format!("`hf download {owner}/{name} --local-dir {name}`, then {option} {name}")
         }
         _ => "`hf download OWNER/NAME --local-dir FOLDER`".to_owned(),
     };
     Err(WrongUsage(format!(
-        "--policy: expected a checkpoint's folder, but {name} is not a folder; download a checkpoint from the \
+        "{option}: expected a checkpoint's folder, but {name} is not a folder; download a checkpoint from the \
          Hugging Face Hub with {download}"
     ))
     .into())

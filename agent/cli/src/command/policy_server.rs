@@ -7,13 +7,14 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use decision::{Policy, Setting};
+use decision::{Policy, PolicyInfo, Setting};
 use remote_policy::{Address, ClientOptions, RemotePolicy};
 use runtime::servers::Host;
 use serde_json::{Value, json};
 
 use super::WrongUsage;
 use super::policy::LoadedPolicy;
+use super::recorded_policy::ServedPolicy;
 
 /// The environment variable with a policy server's key.
 const KEY_VARIABLE: &str = "REVER_POLICY_KEY";
@@ -110,15 +111,15 @@ fn checked(key: &str) -> Result<String> {
     Ok(key.to_owned())
 }
 
-/// The settings that a server can do. One that it cannot do is wrong usage, or skipped if it is a default.
+/// The settings that a policy can do. One that it cannot do is wrong usage, or skipped if it is a default.
 pub fn possible(
-    server: &RemotePolicy,
+    policy: &dyn Policy,
     settings: &[Setting],
     is_default: bool,
 ) -> Result<Vec<Setting>> {
     let mut possible = Vec::new();
     for setting in settings {
-        match server.check(setting) {
+        match policy.check(setting) {
             Ok(()) => possible.push(*setting),
             Err(error) if is_default => eprintln!("skipping {error:#}"),
             Err(error) => return Err(WrongUsage(format!("{error:#}")).into()),
@@ -127,13 +128,22 @@ pub fn possible(
     Ok(possible)
 }
 
-/// What determines a run's results beside the server's digest, for the header.
-pub fn header(server: &RemotePolicy) -> Result<Value> {
-    Ok(json!({
-        "wire": server.address().wire.scheme(),
-        "profile": server.profile_name(),
-        "profile_digest": server.profile_digest()?,
-    }))
+/// What determines a run's results beside the policy's digest, for the header, and what its records can be read with.
+pub fn header(
+    server: &RemotePolicy,
+    policy: &dyn Policy,
+    backbone: Option<&Path>,
+) -> Result<Value> {
+    let PolicyInfo { hidden_size, action_space, .. } = policy.info();
+    let served = ServedPolicy { hidden_size: *hidden_size, action_space: action_space.clone() };
+    let mut header = json!(served);
+    header["wire"] = json!(server.address().wire.scheme());
+    header["profile"] = json!(server.profile_name());
+    header["profile_digest"] = json!(server.profile_digest()?);
+    if let Some(backbone) = backbone {
+        header["backbone"] = json!(backbone);
+    }
+    Ok(header)
 }
 
 #[cfg(test)]

@@ -4,18 +4,21 @@ mod terms;
 mod videos;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use clap::Args;
+use decision::Reasoning;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::episodes::{POLICY_OPTIONS, POLICY_SERVER};
 use super::policy::PolicySource;
+use super::recorded_policy::RecordedPolicy;
 use crate::files::installation;
 use evaluation::report::{self, EpisodeTerms, Readers, Report, ReportOptions, Speech};
 use runtime::servers::{Host, LocalSource, Simulator};
 use store::record::EpisodeRecord;
-use store::run;
+use store::run::{self, RunHeader};
 use terms::ScoreTerms;
 use vla::CompletionParser;
 
@@ -106,29 +109,39 @@ fn build_with(
     let header = run::read_header(options.run)?;
     let digest = header.versions["policy"].as_str();
     let digest = digest.context("run.json: expected the digest of a policy, got none")?;
-    // Only a checkpoint that is named can read the tokens of a policy server, if there are any.
-    let is_named = policy.policy.is_some() && policy.address().is_none();
-    if header.options.get(POLICY_SERVER).is_some() && !is_named {
-        return build_report(options, &silent());
+    if header.options.get(POLICY_SERVER).is_some() {
+        return build_of_server(options, header, verifier);
     }
     let parser = policy.parser_of_run(header.options.get(POLICY_OPTIONS), digest, host)?;
     ensure_parser_of(options.run, &parser)?;
+    let parser = Arc::new(parser);
+    let recorded = RecordedPolicy::Checkpoint(Arc::clone(&parser));
     let speak = |tokens: &[u32]| Speech {
         text: parser.text(tokens),
         reasoning: parser.parse(tokens).ok().map(|parsed| parsed.reasoning),
     };
-    let terms = ScoreTerms::load(verifier, &policy.folder(host)?, &parser)?;
+    let terms = ScoreTerms::load(verifier, Some(&policy.folder(host)?), &recorded)?;
     let explain = |record: &_| terms.of(record);
     build_report(options, &Readers { speak: &speak, terms: terms.names(), explain: &explain })
 }
 
-/// For a policy server, which sends no text that a record holds.
-fn silent() -> Readers<'static> {
-    Readers {
-        speak: &|_| Speech { text: String::new(), reasoning: None },
-        terms: Vec::new(),
-        explain: &|_| Ok(EpisodeTerms::Unknown("The policy was a policy server.".to_owned())),
+/// For a policy server: its records hold what it said, and no text.
+fn build_of_server(
+    options: &ReportOptions<'_>,
+    header: RunHeader,
+    verifier: Option<&Path>,
+) -> Result<Report> {
+    let speak = |_: &[u32]| Speech { text: String::new(), reasoning: Some(Reasoning::default()) };
+    let unknown = "The policy was a policy server; `rever report RUN --verifier FILE` shows the terms of scores.";
+    let explain = |_: &_| Ok(EpisodeTerms::Unknown(unknown.to_owned()));
+    if verifier.is_none() {
+        let readers = Readers { speak: &speak, terms: Vec::new(), explain: &explain };
+        return build_report(options, &readers);
     }
+    let recorded = RecordedPolicy::server_of(&[header])?.context("expected a policy server")?;
+    let terms = ScoreTerms::load(verifier, None, &recorded)?;
+    let explain = |record: &_| terms.of(record);
+    build_report(options, &Readers { speak: &speak, terms: terms.names(), explain: &explain })
 }
 
 fn build_report(options: &ReportOptions<'_>, readers: &Readers<'_>) -> Result<Report> {

@@ -96,9 +96,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let loaded = arguments.policy.load(host)?;
     let verifier = loaded.verifier(arguments.verifier.clone())?;
     let setting = arguments.setting(verifier.is_some())?;
-    if let Some(server) = &loaded.server {
-        server.check(&setting).map_err(|error| WrongUsage(format!("{error:#}")))?;
-    }
+    loaded.policy.check(&setting).map_err(|error| WrongUsage(format!("{error:#}")))?;
     let PolicyArguments { device, kv_cache, .. } = arguments.policy;
     let wanted = arguments.max_clients;
     let clients_max = match &loaded.checkpoint {

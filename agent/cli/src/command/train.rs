@@ -1,26 +1,28 @@
 //! `rever train`: trains a verifier on collected episodes, prints its held-out metrics and stores them in its file.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use decision::ActionSpace;
 use evaluation::table::{COLUMNS_DEFAULT, aligned, wrapped};
 use runtime::servers::Host;
 use runtime::wire::{Network, NetworkOptions, VerifierPublisher};
 use serde::Serialize;
+use store::run::RunHeader;
 use store::write_whole;
 use verifier::training::records::{self, CompletionReader, Excluded};
 use verifier::training::{EPISODES_MIN, Epoch, TrainingEpisode, TrainingSet, train};
 use verifier::{
     Discrimination, Metrics, ReRankingGain, TrainingOptions, Verifier, VerifierDescription,
 };
-use vla::CompletionParser;
 
 use super::WrongUsage;
+use super::episodes::POLICY_SERVER;
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet, short};
 use super::policy::PolicySource;
+use super::recorded_policy::RecordedPolicy;
 
 /// How long to wait for an agent that follows the verifier. After that it is published anyway.
 const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
@@ -108,21 +110,22 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let started = Instant::now();
     let options = options(&arguments)?;
     options.check().map_err(|error| WrongUsage(error.to_string()))?;
-    for folder in &arguments.runs {
-        store::run::read_header(folder).map_err(|error| WrongUsage(format!("{error:#}")))?;
-    }
-    let parser = arguments.policy.parser(host)?;
-    let action_space = parser.action_space();
-    let (episodes, excluded) = read(&arguments, &parser, &action_space)?;
+    let header = |folder: &PathBuf| {
+        store::run::read_header(folder).map_err(|error| WrongUsage(format!("{error:#}")))
+    };
+    let headers: Vec<RunHeader> = arguments.runs.iter().map(header).collect::<Result<_, _>>()?;
+    let policy = arguments.recorded_policy(&headers, host)?;
+    let (episodes, excluded) = policy.with_reader(|reader| read(&arguments, reader))?;
     ensure!(
         !episodes.is_empty(),
         "training: expected eligible episodes, got none; excluded: {}; run `rever collect` first",
         counts(&excluded)
     );
-    let set = TrainingSet::new(parser.hidden_size(), action_space.length(), episodes)?;
+    let action_length = policy.action_space().length();
+    let set = TrainingSet::new(policy.hidden_size(), action_length, episodes)?;
     let (count, repeats) = (set.episodes().len(), set.repeats());
     eprintln!("{count} episodes, {repeats} repeats skipped, excluded: {}", counts(&excluded));
-    let verifier = train(&set, parser.digest(), &options, |epoch| report(epoch, &options))?;
+    let verifier = train(&set, policy.digest(), &options, |epoch| report(epoch, &options))?;
     write_whole(&arguments.out, verifier.bytes())?;
     print!("{}", table(&verifier));
     let out = arguments.out.display();
@@ -137,25 +140,47 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
         };
         write_whole(json, &serde_json::to_vec_pretty(&result)?)?;
     }
-    let policy = arguments.policy.words();
-    println!("next: rever evaluate{policy} --strategies sample,verifier --verifier {out}");
+    let words = match (policy, headers.first()) {
+        (RecordedPolicy::Server { .. }, Some(header)) => served_words(header),
+        _ => arguments.policy.words(),
+    };
+    println!("next: rever evaluate{words} --strategies sample,verifier --verifier {out}");
     match &arguments.name {
         Some(name) => publish(&arguments, name, &verifier),
         None => Ok(()),
     }
 }
 
+impl Arguments {
+    /// The policy of the episodes. A policy server of the named runs needs no checkpoint.
+    fn recorded_policy(&self, headers: &[RunHeader], host: &Host) -> Result<RecordedPolicy> {
+        let server = match self.policy.policy {
+            Some(_) => None,
+            None => RecordedPolicy::server_of(headers)?,
+        };
+        let checkpoint = || self.policy.parser(host).map(Arc::new).map(RecordedPolicy::Checkpoint);
+        server.map_or_else(checkpoint, Ok)
+    }
+}
+
+/// The policy options of a run with a policy server, with a space before each. Its address is not part of the run.
+fn served_words(header: &RunHeader) -> String {
+    let server = &header.options[POLICY_SERVER];
+    let word = |name: &str| server[name].as_str();
+    let mut words = format!(" --policy {}://HOST:PORT", word("wire").unwrap_or("openpi"));
+    if let Some(profile) = word("profile") {
+        words += &format!(" --policy-profile {profile}");
+    }
+    if let Some(backbone) = word("backbone") {
+        words += &format!(" --backbone {backbone}");
+    }
+    words
+}
+
 fn read(
     arguments: &Arguments,
-    parser: &CompletionParser,
-    action_space: &ActionSpace,
+    reader: CompletionReader<'_>,
 ) -> Result<(Vec<TrainingEpisode>, Excluded)> {
-    let reader = CompletionReader {
-        policy: parser.digest(),
-        action_space,
-        parse: &|tokens| parser.parse(tokens),
-        confidence: &|tokens, log_probabilities| parser.confidence(tokens, log_probabilities),
-    };
     if arguments.runs.is_empty() {
         return records::from_labels(&arguments.labels, reader);
     }

@@ -149,10 +149,12 @@ fn candidate(
     readers: &Readers<'_>,
     phrases: &mut Phrases,
 ) -> anyhow::Result<Candidate> {
-    // A policy that tells no tokens has no text and no reasoning.
-    let speech = match record.tokens.is_empty() {
-        true => super::Speech { text: String::new(), reasoning: Some(Reasoning::default()) },
-        false => (readers.speak)(&record.tokens),
+    let silent = |reasoning| super::Speech { text: String::new(), reasoning: Some(reasoning) };
+    // A policy that tells no tokens has no text.
+    let speech = match &record.said {
+        Some(said) => silent(said.reasoning.clone()),
+        None if record.tokens.is_empty() => silent(Reasoning::default()),
+        None => (readers.speak)(&record.tokens),
     };
     let score = record.score.map(|score| rounded(score, 8));
     let log = rounded(record.log_probability, 2);

@@ -113,27 +113,33 @@ impl RemotePolicy {
     pub fn announcement(&self) -> Option<&Announcement> {
         self.shared.greeting.announcement.as_ref()
     }
+}
 
-    /// Whether a learned verifier can read the server's candidates.
-    pub fn has_hidden(&self) -> bool {
-        self.announcement().is_some_and(|announced| {
-            announced.hidden_size.is_some()
-                && announced.confidence_size.is_some()
-                && announced.digest.is_some()
-                && announced.action_scale.is_some()
-        })
+impl Drop for RemotePolicy {
+    /// A runtime must not be dropped where a caller's runtime runs.
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+    }
+}
+
+#[async_trait]
+impl Policy for RemotePolicy {
+    fn info(&self) -> &PolicyInfo {
+        &self.info
     }
 
-    /// Refuses a setting that this server cannot do, before anything is started.
-    pub fn check(&self, setting: &Setting) -> Result<()> {
+    fn check(&self, setting: &Setting) -> Result<()> {
         let Setting { strategy, candidates, temperature } = *setting;
         let place = self.address();
         let answers = self.shared.target.profile.server.answers;
         if strategy.needs_verifier() {
             ensure!(
-                self.has_hidden(),
+                self.info.hidden_size.is_some(),
                 "strategy {strategy}: expected a policy that exposes hidden states and log-probabilities, but {place} \
-                 does not announce all of digest, hidden_size, confidence_size and action_scale; sample, first-well-formed, majority and medoid need none"
+                 does not announce all of digest, hidden_size, confidence_size and action_scale; --backbone included lets \
+                 a checkpoint read its candidates instead; sample, first-well-formed, majority and medoid need none"
             );
         }
         let Some(announced) = self.announcement() else {
@@ -164,22 +170,6 @@ impl RemotePolicy {
             "{setting}: {place} does not announce that it can decode greedily"
         );
         Ok(())
-    }
-}
-
-impl Drop for RemotePolicy {
-    /// A runtime must not be dropped where a caller's runtime runs.
-    fn drop(&mut self) {
-        if let Some(runtime) = self.runtime.take() {
-            runtime.shutdown_background();
-        }
-    }
-}
-
-#[async_trait]
-impl Policy for RemotePolicy {
-    fn info(&self) -> &PolicyInfo {
-        &self.info
     }
 
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
@@ -297,7 +287,7 @@ fn info(target: &Target, greeting: &Greeting) -> Result<PolicyInfo> {
         digest,
         image_size: (profile.camera.height, profile.camera.width),
         action_space: profile.actions.space(),
-        hidden_size: announced.and_then(|announced| announced.hidden_size),
+        hidden_size: announced.filter(|one| one.has_hidden()).and_then(|one| one.hidden_size),
         parallel_calls: PARALLEL_CALLS,
     })
 }

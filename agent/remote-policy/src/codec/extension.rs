@@ -94,6 +94,14 @@ fn fields<'a, 'b>(map: &'b Value<'a>) -> Result<Option<&'b Value<'a>>> {
 }
 
 impl Announcement {
+    /// Whether a learned verifier can read this server's candidates.
+    pub fn has_hidden(&self) -> bool {
+        self.hidden_size.is_some()
+            && self.confidence_size.is_some()
+            && self.digest.is_some()
+            && self.action_scale.is_some()
+    }
+
     /// Reads the announcement of a server; `None` if it makes none.
     pub fn read(map: &Value<'_>) -> Result<Option<Announcement>> {
         let Some(fields) = fields(map)? else { return Ok(None) };

@@ -99,7 +99,9 @@ impl ServedAgent {
             temperature > 0.0 || candidates == 1,
             "rever.candidates: expected 1 at temperature 0, got {candidates}"
         );
-        Ok(Setting::new(self.strategy(candidates), candidates, temperature))
+        let setting = Setting::new(self.strategy(candidates), candidates, temperature);
+        self.options.policy.check(&setting)?;
+        Ok(setting)
     }
 
     /// With one candidate, a server of greedy actions samples if asked to; with several, the first

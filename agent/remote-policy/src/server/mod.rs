@@ -19,7 +19,6 @@ mod listen;
 mod observation;
 mod openpi;
 mod reply;
-mod resize;
 mod session;
 mod vla_eval;
 
@@ -28,7 +27,6 @@ pub use agent::{AgentOptions, ServedAgent};
 pub use key::ApiKey;
 pub use listen::{MESSAGE_BYTES_MAX, ServerOptions, serve};
 pub use observation::ObservationKeys;
-pub use resize::fit;
 
 #[cfg(test)]
 mod tests;

@@ -3,7 +3,6 @@
 use anyhow::{Context, Result, bail, ensure};
 use decision::{Image, Observation, PolicyInfo};
 
-use super::resize::fit;
 use crate::codec::{Array, Value, decode_image};
 
 /// Maximum length of an instruction.
@@ -52,7 +51,7 @@ impl ObservationKeys {
             })?,
             None => known_camera(map)?,
         };
-        fit(decode_image(value)?, info.image_size)
+        decision::fit_image(decode_image(value)?, info.image_size)
     }
 
     /// Empty if there is none and none was named.

@@ -6,13 +6,13 @@ use std::time::Instant;
 
 use batching::{Answer, DecisionBatcher};
 use decision::{
-    Candidate, Decision, EpisodeContext, EpisodeName, EpisodeToken, Observation, Policy, Scorer,
-    probability,
+    Candidate, Decision, EpisodeContext, EpisodeName, EpisodeToken, Observation, Parsed, Policy,
+    Scorer, probability,
 };
 use protocol::{Reset, TaskDescription};
 use store::queue::Lease;
 use store::record::{
-    CandidateRecord, DecisionRecord, EpisodeRecord, RECORD_VERSION, StepRecord, Versions,
+    CandidateRecord, DecisionRecord, EpisodeRecord, RECORD_VERSION, Said, StepRecord, Versions,
     hidden_to_bytes,
 };
 
@@ -121,7 +121,8 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
         self.first_decisions.note(&candidates, self.policy)?;
         let records = candidates.into_iter().enumerate().map(|(index, candidate)| {
             let keep_hidden = self.options.all_hidden || chosen == Some(index);
-            candidate_record(candidate, logits.as_ref().map(|logits| logits[index]), keep_hidden)
+            let logit = logits.as_ref().map(|logits| logits[index]);
+            candidate_record(candidate, logit, keep_hidden, self.options.said)
         });
         let mut decision = Some(DecisionRecord {
             candidates: records.collect(),
@@ -196,19 +197,23 @@ fn candidate_record(
     candidate: Candidate,
     logit: Option<f32>,
     keep_hidden: bool,
+    keep_said: bool,
 ) -> CandidateRecord {
     let is_well_formed = candidate.parsed.is_ok();
-    let (actions, unread, malformed) = match candidate.parsed {
-        Ok(parsed) => {
-            let unread = parsed.reasoning.unread.iter().map(ToString::to_string).collect();
-            (Some(parsed.actions), unread, None)
+    let (actions, unread, malformed, said) = match candidate.parsed {
+        Ok(Parsed { reasoning, action_tokens, actions }) => {
+            let unread = reasoning.unread.iter().map(ToString::to_string).collect();
+            let confidence = candidate.confidence;
+            let said = keep_said.then_some(Said { reasoning, action_tokens, confidence });
+            (Some(actions), unread, None, said)
         }
-        Err(malformed) => (None, Vec::new(), Some(malformed.to_string())),
+        Err(malformed) => (None, Vec::new(), Some(malformed.to_string()), None),
     };
     CandidateRecord {
         actions,
         malformed,
         unread,
+        said,
         // A malformed candidate has no action, so it has no success probability.
         score: logit.filter(|_| is_well_formed).map(probability),
         log_probability: candidate.log_probability,

@@ -42,6 +42,8 @@ pub struct RecordOptions {
     pub all_hidden: bool,
     /// Record a video of every episode.
     pub video: bool,
+    /// Record what the policy says of a candidate, for a policy whose tokens cannot be decoded.
+    pub said: bool,
 }
 
 /// Everything that a rollout uses.

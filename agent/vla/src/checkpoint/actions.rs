@@ -1,7 +1,7 @@
 //! Action tokens: OpenVLA's bins and their conversion to metres, rotation vector and gripper
 //! command.
 
-use decision::rotation_vector;
+use decision::{roll_pitch_yaw, rotation_vector};
 
 use crate::checkpoint::config::{ACTION_LENGTH, ActionScale};
 
@@ -44,6 +44,29 @@ impl ActionBins {
         let rotation = rotation_vector(roll, pitch, yaw);
         let gripper = if gripper > 0.5 { 1.0 } else { -1.0 };
         [x, y, z, rotation[0], rotation[1], rotation[2], gripper].map(|number| number as f32)
+    }
+
+    /// The ids of the bins of an action, by OpenVLA's `digitize`: the inverse of [`Self::decode`]
+    /// up to the width of a bin. Numbers beyond the range are in the outermost bins. Of the two ids
+    /// that share the last centre this is the outer one, which stands for all numbers beyond it.
+    pub fn encode(&self, action: &[f32; ACTION_LENGTH]) -> [u32; ACTION_LENGTH] {
+        let [x, y, z, a, b, c, gripper] = action.map(f64::from);
+        let [roll, pitch, yaw] = roll_pitch_yaw([a, b, c]);
+        let physical = [x, y, z, roll, pitch, yaw, if gripper > 0.0 { 1.0 } else { 0.0 }];
+        std::array::from_fn(|index| {
+            let (low, high) = (self.scale.q01[index], self.scale.q99[index]);
+            let value = physical[index];
+            let scaled = match self.scale.mask[index] {
+                true if high > low => 2.0 * (value - low) / (high - low) - 1.0,
+                true => 0.0,
+                false => value,
+            };
+            // np.digitize: the number of edges of np.linspace(-1, 1, bins) that are not above it.
+            let steps = (self.bins - 1) as f64;
+            let digit = ((scaled.clamp(-1.0, 1.0) + 1.0) / 2.0 * steps).floor() as usize + 1;
+            let outer = if digit + 1 == self.bins { self.bins } else { digit };
+            (self.vocabulary - outer) as u32
+        })
     }
 
     /// The unit of each dimension of an action: its range, and 2 for the gripper.
@@ -94,6 +117,23 @@ mod tests {
         assert_eq!(action[3..6], [0.0; 3]);
         assert_eq!(action[6], 1.0);
         assert_eq!(openvla().decode([31872; 7])[6], -1.0);
+    }
+
+    #[test]
+    fn actions_are_encoded_as_the_bins_that_they_were_decoded_from() {
+        let bins = openvla();
+        for digit in [1_usize, 2, 77, 128, 200, 254] {
+            // The gripper has two commands: 1 is in the last bin and 0 in the middle one.
+            for gripper in [1_usize, 255] {
+                let mut ids = [(32000 - digit) as u32; 7];
+                ids[6] = (32000 - gripper) as u32;
+                let expected = if gripper == 255 { 32000 - 256 } else { 32000 - 128 };
+                let encoded = bins.encode(&bins.decode(ids));
+                assert_eq!((&encoded[..6], encoded[6]), (&ids[..6], expected), "digit {digit}");
+            }
+        }
+        let far = bins.encode(&[9.0, -9.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
+        assert_eq!((far[0], far[1]), (32000 - 256, 32000 - 1));
     }
 
     #[test]

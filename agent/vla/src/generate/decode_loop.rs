@@ -9,8 +9,9 @@ use candle_core::Tensor;
 use rayon::prelude::*;
 
 use crate::checkpoint::actions::ActionBins;
+use crate::checkpoint::config::ACTION_LENGTH;
 use crate::checkpoint::parse::{is_action, is_complete};
-use crate::generate::sampling::{Draw, Stream, draw};
+use crate::generate::sampling::{Draw, Stream, draw, forced};
 use crate::kernels::segment::GROWTH;
 use crate::network::forward::{Context, Network};
 
@@ -22,6 +23,9 @@ pub struct Continuation<'a> {
     pub seed: u64,
     /// Maximum length of a completion; a longer one is cut after one more token.
     pub tokens_max: usize,
+    /// The action tokens of each candidate, if the network is to read actions instead of choosing
+    /// them: what comes before the action is still drawn. Empty otherwise.
+    pub actions: &'a [[u32; ACTION_LENGTH]],
 }
 
 /// The conditions under which a completion ends.
@@ -48,6 +52,8 @@ pub struct Completion {
     temperature: f32,
     stream: Stream,
     tokens_max: usize,
+    /// The action tokens of a completion whose action is given.
+    action: Option<[u32; ACTION_LENGTH]>,
     /// The row that computes this completion. Completions of a session share a row as long as they
     /// agree.
     row: Option<usize>,
@@ -98,6 +104,7 @@ fn start(sessions: &[Continuation<'_>]) -> Vec<Completion> {
             temperature: session.temperature,
             stream: Stream::new(session.seed, candidate),
             tokens_max: session.tokens_max,
+            action: session.actions.get(candidate).copied(),
             row: Some(index),
         })
     });
@@ -137,8 +144,11 @@ fn extend(
 impl Completion {
     /// The next token, or `None` when the completion is finished.
     fn draw(&mut self, logits: &[f32], limits: &Limits<'_>) -> Result<Option<u32>> {
-        let Draw { token, log_probability } =
-            draw(logits, self.temperature, self.stream.uniform())?;
+        let drawn = draw(logits, self.temperature, self.stream.uniform())?;
+        let Draw { token, log_probability } = match self.given(drawn.token, limits) {
+            Some(token) => forced(logits, token)?,
+            None => drawn,
+        };
         if limits.action_ends && token != limits.end && is_action(&self.tokens, limits.bins) {
             // The token is not part of the candidate. This step was computed for the hidden state
             // of the last action token.
@@ -153,6 +163,18 @@ impl Completion {
         let done = self.tokens.len() > self.tokens_max || is_complete(&self.tokens, limits.bins);
         Ok(if done { None } else { Some(token) })
     }
+
+    /// The token of a given action, once the network begins an action; then the end.
+    fn given(&self, drawn: u32, limits: &Limits<'_>) -> Option<u32> {
+        let action = self.action?;
+        match self.tokens.iter().position(|&id| limits.bins.contains(id)) {
+            None => limits.bins.contains(drawn).then_some(action[0]),
+            Some(start) => {
+                let place = self.tokens.len() - start;
+                Some(action.get(place).copied().unwrap_or(limits.end))
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -164,6 +186,14 @@ mod tests {
 
     /// The tokens of a greedy completion if the network wants `ids`, and their log-probability.
     fn completed(ids: &[u32], action_ends: bool) -> (Vec<u32>, f64) {
+        completed_with(ids, action_ends, None)
+    }
+
+    fn completed_with(
+        ids: &[u32],
+        action_ends: bool,
+        action: Option<[u32; ACTION_LENGTH]>,
+    ) -> (Vec<u32>, f64) {
         let scale = ActionScale { q01: [0.0; 7], q99: [1.0; 7], mask: [true; 7] };
         let bins = ActionBins::new(300, 256, scale);
         let limits = Limits { bins: &bins, vocabulary: 300, end: END, action_ends };
@@ -176,6 +206,7 @@ mod tests {
             temperature: 0.0,
             stream: Stream::new(0, 0),
             tokens_max: 8,
+            action,
             row: Some(0),
         };
         for &id in ids {
@@ -204,5 +235,19 @@ mod tests {
         assert_eq!(completed(&more, false).0, more, "a chain of thought must end");
         let late = [&[5], &action[..]].concat();
         assert_eq!(completed(&late, true).0, late, "an action comes first or is none");
+    }
+
+    #[test]
+    fn a_given_action_replaces_that_of_the_network_and_nothing_before_it() {
+        let given = [110, 111, 112, 113, 114, 115, 116];
+        // The network would write 5, an action and then an eighth action token.
+        let wanted = [5, 100, 101, 102, 103, 104, 105, 106, 107];
+        let (tokens, sum) = completed_with(&wanted, false, Some(given));
+        assert_eq!(tokens, [&[5], &given[..]].concat());
+        // One token that the network wants, and eight, with the end, that it does not.
+        let (likely, unlikely) =
+            (completed(&[5], true).1, completed_with(&[100], true, Some(given)).1);
+        assert!((sum - likely - 8.0 * unlikely).abs() < 1e-9, "{sum}");
+        assert_eq!(completed_with(&[5, 6, END], false, Some(given)).0, [5, 6], "no action begins");
     }
 }

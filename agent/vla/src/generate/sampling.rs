@@ -64,6 +64,15 @@ pub fn draw(logits: &[f32], temperature: f32, uniform: f64) -> Result<Draw> {
     Ok(Draw { token: token as u32, log_probability })
 }
 
+/// The given token with its log-probability at temperature 1.
+pub fn forced(logits: &[f32], token: u32) -> Result<Draw> {
+    let (_, largest) = argmax(logits);
+    ensure!(largest.is_finite(), "logits: expected finite numbers, got {largest}");
+    let natural = soften_fast(logits, largest, 1.0, &mut vec![0.0f32; logits.len()]);
+    let log_probability = f64::from(logits[token as usize] - largest) - natural.ln();
+    Ok(Draw { token, log_probability })
+}
+
 /// The first of the largest logits, or the first NaN.
 fn argmax(logits: &[f32]) -> (usize, f32) {
     let mut best = 0;
@@ -151,6 +160,16 @@ mod tests {
         for (index, a) in firsts.iter().enumerate() {
             assert!(firsts[index + 1..].iter().all(|b| a != b), "{firsts:?}");
         }
+    }
+
+    #[test]
+    fn a_forced_token_has_the_log_probability_that_it_has_when_it_is_drawn() -> Result<()> {
+        let logits = [0.5f32, -1.0, 2.0, 0.0, 1.5];
+        for index in 0..20 {
+            let drawn = draw(&logits, 1.0, Stream::new(3, index).uniform())?;
+            assert_eq!(forced(&logits, drawn.token)?, drawn);
+        }
+        Ok(())
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Tests of the whole policy: parity with PyTorch, shared prefixes, batches, seeds, refusals.
 
+mod backbone;
 mod checkpoint;
 mod families;
 mod loading;

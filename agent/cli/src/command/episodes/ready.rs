@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Result, bail};
 use decision::{Policy, Setting};
+use remote_policy::RemotePolicy;
 use runtime::servers::Host;
 use serde_json::Value;
 use verifier::Verifier;
@@ -38,8 +39,10 @@ impl EpisodesArguments {
             None => Some(self.policy.source.folder(host)?),
         };
         let server = remote.as_ref().and_then(|loaded| loaded.server.clone());
-        let settings = match &server {
-            Some(server) => policy_server::possible(server, &request.settings, request.is_default)?,
+        let settings = match &remote {
+            Some(LoadedPolicy { policy, .. }) => {
+                policy_server::possible(&**policy, &request.settings, request.is_default)?
+            }
             None => request.settings.clone(),
         };
         let file = self.verifier_file(folder.as_deref());
@@ -61,7 +64,9 @@ impl EpisodesArguments {
         let digest = &policy.info().digest;
         let verifier = file.map(|file| Verifier::load(&file, digest).map(Arc::new)).transpose();
         let verifier = verifier.map_err(wrong_usage)?;
-        let server = server.as_deref().map(policy_server::header).transpose()?;
+        let backbone = self.policy.backbone.as_deref();
+        let header = |server: &RemotePolicy| policy_server::header(server, &*policy, backbone);
+        let server = server.as_deref().map(header).transpose()?;
         Ok(Ready { policy, checkpoint, settings, verifier, server })
     }
 
@@ -93,7 +98,7 @@ impl EpisodesArguments {
                 "there is no {VERIFIER_FILE} in {}; train one with `rever collect --policy {0}` and `rever train --policy {0}`",
                 policy.display()
             ),
-            None => "a policy server has no folder with one".to_owned(),
+            None => "a policy server has no folder with one; `rever train RUN` makes one from a run of `rever collect`".to_owned(),
         };
         if !is_default {
             let strategy = setting.strategy;

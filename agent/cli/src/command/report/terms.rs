@@ -3,14 +3,13 @@
 use std::path::Path;
 
 use anyhow::{Result, ensure};
-use decision::{ActionSpace, probability};
+use decision::probability;
 use evaluation::report::EpisodeTerms;
 use store::record::{DecisionRecord, EpisodeRecord};
-use verifier::training::records::CompletionReader;
 use verifier::{LOGITS_PER_PROBABILITY, Verifier, explain, term_names};
-use vla::CompletionParser;
 
 use crate::command::names::short;
+use crate::command::recorded_policy::RecordedPolicy;
 use crate::files::VERIFIER_FILE;
 
 /// Terms whose scores differ by more than this from the recorded ones explain something else.
@@ -19,26 +18,23 @@ const SCORE_TOLERANCE: f64 = 1e-3;
 /// A verifier, if there is one, and what reads the records that it scored.
 pub struct ScoreTerms<'a> {
     verifier: Option<Verifier>,
-    parser: &'a CompletionParser,
-    action_space: ActionSpace,
+    policy: &'a RecordedPolicy,
 }
 
 impl<'a> ScoreTerms<'a> {
     /// Loads the named verifier, or the one in the policy's folder if there is one.
     pub fn load(
         named: Option<&Path>,
-        policy: &Path,
-        parser: &'a CompletionParser,
+        folder: Option<&Path>,
+        policy: &'a RecordedPolicy,
     ) -> Result<ScoreTerms<'a>> {
-        let beside = policy.join(VERIFIER_FILE);
+        let beside = folder.map(|folder| folder.join(VERIFIER_FILE)).filter(|file| file.is_file());
         let verifier = match named {
-            Some(path) => Some(Verifier::load(path, parser.digest())?),
+            Some(path) => Some(Verifier::load(path, policy.digest())?),
             // One that does not belong to the policy did not score its candidates either.
-            None => {
-                beside.is_file().then(|| Verifier::load(&beside, parser.digest()).ok()).flatten()
-            }
+            None => beside.and_then(|file| Verifier::load(&file, policy.digest()).ok()),
         };
-        Ok(ScoreTerms { verifier, parser, action_space: parser.action_space() })
+        Ok(ScoreTerms { verifier, policy })
     }
 
     /// What each term is; none without a verifier that has terms.
@@ -63,14 +59,8 @@ impl<'a> ScoreTerms<'a> {
                 short(digest)
             ));
         };
-        let parser = self.parser;
-        let reader = CompletionReader {
-            policy: parser.digest(),
-            action_space: &self.action_space,
-            parse: &|tokens| parser.parse(tokens),
-            confidence: &|tokens, log_probabilities| parser.confidence(tokens, log_probabilities),
-        };
-        let Some(steps) = explain(verifier, record, reader)? else {
+        let explained = self.policy.with_reader(|reader| explain(verifier, record, reader))?;
+        let Some(steps) = explained else {
             return unknown(
                 "This verifier is a network without a ranking: its scores have no terms."
                     .to_owned(),
@@ -134,6 +124,7 @@ mod tests {
             log_probability: 0.0,
             log_probabilities: Vec::new(),
             hidden: None,
+            said: None,
         };
         let candidates = [0.5_f32, 0.9].map(candidate).to_vec();
         let decision = DecisionRecord { candidates, chosen: Some(1), batch_ms: 1.0, batch_size: 1 };

@@ -128,7 +128,7 @@ fn a_server_of_another_kind_or_version_is_refused_at_the_start() {
     );
     let policy = connect(&format!("vla-eval://{}", announcing.place), None).expect("a policy");
     assert_eq!(policy.announcement().map(|announced| announced.candidates_max), Some(4));
-    assert!(policy.info().hidden_size.is_none() && !policy.has_hidden());
+    assert!(policy.info().hidden_size.is_none());
     let newer = Scripted::start(
         0,
         Vec::new(),

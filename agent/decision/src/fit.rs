@@ -1,14 +1,14 @@
-//! Fits a client's image to the policy's size.
+//! Fits an image to a policy's size.
 
 use anyhow::{Context, Result};
-use decision::Image;
 use fast_image_resize::images::{Image as Pixels, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
+use protocol::message::Image;
 
 /// The image in the policy's size (height, width): unchanged if it has that size, otherwise resized
 /// with a Lanczos filter of radius 3 to exactly these sides, as OpenVLA's Bridge evaluation does. The
 /// aspect ratio is not kept.
-pub fn fit(image: Image, (height, width): (usize, usize)) -> Result<Image> {
+pub fn fit_image(image: Image, (height, width): (usize, usize)) -> Result<Image> {
     if (image.height, image.width) == (height, width) {
         return Ok(image);
     }
@@ -34,11 +34,11 @@ mod tests {
     fn an_image_of_another_size_is_resized_and_one_of_the_right_size_is_not_touched() {
         let pixels: Vec<u8> = (0..4 * 6 * 3).map(|index| index as u8).collect();
         let image = Image { height: 4, width: 6, pixels: pixels.into() };
-        let same = fit(image.clone(), (4, 6)).expect("the same");
+        let same = fit_image(image.clone(), (4, 6)).expect("the same");
         assert_eq!(same.pixels, image.pixels);
-        let other = fit(image, (3, 3)).expect("resized");
+        let other = fit_image(image, (3, 3)).expect("resized");
         assert_eq!((other.height, other.width, other.pixels.len()), (3, 3, 27));
         let grey = Image { height: 9, width: 5, pixels: vec![77; 9 * 5 * 3].into() };
-        assert!(fit(grey, (4, 4)).expect("resized").pixels.iter().all(|pixel| *pixel == 77));
+        assert!(fit_image(grey, (4, 4)).expect("resized").pixels.iter().all(|pixel| *pixel == 77));
     }
 }

@@ -1,0 +1,117 @@
+//! What reads the candidates in the records of a run: the checkpoint that proposed them, or the records alone if it was
+//! a policy server.
+
+use std::sync::Arc;
+
+use anyhow::{Context, Result, ensure};
+use decision::{ActionSpace, Malformed};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use store::run::RunHeader;
+use verifier::training::records::CompletionReader;
+use vla::CompletionParser;
+
+use super::WrongUsage;
+use super::episodes::POLICY_SERVER;
+
+/// The policy of the records.
+pub enum RecordedPolicy {
+    /// A checkpoint, whose tokenizer decodes the recorded tokens.
+    Checkpoint(Arc<CompletionParser>),
+    /// A policy server. The records hold what it said, or what the backbone read.
+    Server {
+        /// Identity of the policy.
+        digest: String,
+        /// Length of a candidate's hidden state.
+        hidden_size: usize,
+        /// How to compare its actions.
+        action_space: ActionSpace,
+    },
+}
+
+/// What the header of a run with a policy server says of its candidates.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ServedPolicy {
+    /// Length of a candidate's hidden state; `None` if the server exposes none and no backbone read the candidates.
+    pub hidden_size: Option<usize>,
+    /// How to compare its actions.
+    pub action_space: ActionSpace,
+}
+
+impl RecordedPolicy {
+    /// The policy server of runs; `None` unless the first run has one. All runs must have the same policy.
+    pub fn server_of(headers: &[RunHeader]) -> Result<Option<RecordedPolicy>> {
+        let Some(first) = headers.first() else { return Ok(None) };
+        let Some(server) = first.options.get(POLICY_SERVER) else { return Ok(None) };
+        let served = ServedPolicy::deserialize(server).context("run.json: policy_server")?;
+        let digest = policy_digest(first)?;
+        for header in headers {
+            let got = policy_digest(header)?;
+            ensure!(
+                got == digest,
+                WrongUsage(format!(
+                    "runs: expected runs of one policy, got those of {digest} and of {got}"
+                ))
+            );
+        }
+        let hidden_size = served.hidden_size.filter(|size| *size > 0).with_context(|| {
+            WrongUsage(
+                "the policy server of this run exposes no hidden states, which a verifier reads; collect episodes with \
+                 --backbone included, so that a checkpoint reads its candidates"
+                    .to_owned(),
+            )
+        })?;
+        let action_space = served.action_space;
+        Ok(Some(RecordedPolicy::Server { digest: digest.to_owned(), hidden_size, action_space }))
+    }
+
+    /// Identity of the policy, in hexadecimal.
+    pub fn digest(&self) -> &str {
+        match self {
+            RecordedPolicy::Checkpoint(parser) => parser.digest(),
+            RecordedPolicy::Server { digest, .. } => digest,
+        }
+    }
+
+    /// Length of a candidate's hidden state.
+    pub fn hidden_size(&self) -> usize {
+        match self {
+            RecordedPolicy::Checkpoint(parser) => parser.hidden_size(),
+            RecordedPolicy::Server { hidden_size, .. } => *hidden_size,
+        }
+    }
+
+    /// How to compare its actions.
+    pub fn action_space(&self) -> ActionSpace {
+        match self {
+            RecordedPolicy::Checkpoint(parser) => parser.action_space(),
+            RecordedPolicy::Server { action_space, .. } => action_space.clone(),
+        }
+    }
+
+    /// Calls `read` with what decodes the candidates.
+    pub fn with_reader<T>(&self, read: impl FnOnce(CompletionReader<'_>) -> T) -> T {
+        let (policy, action_space) = (self.digest(), &self.action_space());
+        match self {
+            RecordedPolicy::Checkpoint(parser) => read(CompletionReader {
+                policy,
+                action_space,
+                parse: &|tokens| parser.parse(tokens),
+                confidence: &|tokens, log_probabilities| {
+                    parser.confidence(tokens, log_probabilities)
+                },
+            }),
+            RecordedPolicy::Server { .. } => read(CompletionReader {
+                policy,
+                action_space,
+                parse: &|_| Err(Malformed::new("expected a record of what the policy server said")),
+                confidence: &|_, _| Vec::new(),
+            }),
+        }
+    }
+}
+
+fn policy_digest(header: &RunHeader) -> Result<&str> {
+    let digest = header.versions.get("policy").and_then(Value::as_str);
+    digest.context("run.json: expected the digest of a policy, got none")
+}
