@@ -3,16 +3,15 @@
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures import wait
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rever_env import reasoning
+from rever_env import reasoning, workers
 from rever_env.expert import Decision
 from rever_env.tasks import Task
 from rever_env.world import Observation, World
@@ -213,8 +212,7 @@ def demonstrate(
     total = episodes * len(tasks)
     seeds = range(seed, seed + episodes)
     before = _recorded(tasks, seeds, out)
-    # spawn: threads of other libraries do not survive a fork.
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    with workers.pool(processes) as pool:
         futures = [pool.submit(record_share, share) for share in shares]
         while not all(future.done() for future in futures):
             wait(futures, timeout=_REPORT_SECONDS)

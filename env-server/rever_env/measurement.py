@@ -3,11 +3,11 @@
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import TYPE_CHECKING
 
+from rever_env import workers
 from rever_env.demonstrations import Noise
 from rever_env.tasks import Task
 from rever_env.world import World
@@ -71,7 +71,7 @@ def measure(
         rows.setdefault(key, Row(*key))
     started = time.monotonic()
     total = sum(len(chunk.seeds) for chunk in chunks)
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    with workers.pool(processes) as pool:
         for future in as_completed([pool.submit(run, chunk) for chunk in chunks]):
             part = future.result()
             _add(rows[part.task, part.suite], part)
