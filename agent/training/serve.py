@@ -1,115 +1,149 @@
-"""Serves a checkpoint in PyTorch to policy clients: vla-eval's model server, or openpi's protocol.
+"""Serves a checkpoint of this folder's networks: bridge-small's kind, or bridge-flow's.
 
-python agent/training/serve.py --model DIR --wire vla-eval [--port 8001] [--temperature 0]
+    python agent/training/serve.py --model DIR [--wire openpi] [--port 8001]
 
-Needs torch, safetensors, tokenizers, and vla-eval or openpi-client. `serve.toml` is its profile for
-`rever evaluate --policy vla-eval://127.0.0.1:8001 --policy-profile agent/training/serve.toml`.
+Needs torch, safetensors, tokenizers, and what policy_server.py needs. Profiles for `rever evaluate
+--policy-profile`: serve.toml for bridge-small, serve_flow.toml for bridge-flow.
 """
 
 from __future__ import annotations
 
 import argparse
-import asyncio
-import traceback
+import json
+import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 import checkpoint
-from actions import DIMENSIONS
+import flow
+import policy_server
+from actions import DIMENSIONS, Statistics, world_from_model
 from generation import COMPLETION_TOKENS, decode, generate
+from policy_server import Candidate, Description, Draw, Observation
 
-LOOPBACK = "127.0.0.1"
+FILES = ["config.json", "model.safetensors", "tokenizer.json"]
+# Closed is -1, open is 1.
+GRIPPER_SPAN = 2.0
 
 
-class Policy:
-    """A checkpoint as a function of image and instruction."""
+class TokenPolicy:
+    """A network that writes tokens, `model_type` openvla: one action per decision."""
 
-    def __init__(self, model: Path, temperature: float, seed: int) -> None:
-        self.checkpoint = checkpoint.read(model)
-        self.temperature = temperature
-        self.generator = torch.Generator().manual_seed(seed)
+    def __init__(self, folder: Path) -> None:
+        self.checkpoint = checkpoint.read(folder)
+        side = self.checkpoint.network.config.vision.image_size
+        self.description = describe(folder, 0.0, side, self.checkpoint.statistics)
 
-    def act(self, image: NDArray[np.uint8], instruction: str) -> NDArray[np.float32]:
-        """(height, width, 3) -> 7: metres, rotation vector, gripper +1 open and -1 closed.
-
-        Raises ValueError if the completion does not end in seven action tokens.
-        """
+    def act(self, observation: Observation, draw: Draw) -> list[Candidate]:
+        """(1, 7) each: metres, rotation vector, gripper +1 open and -1 closed."""
+        check_image(observation, self.description)
         tokenizer = self.checkpoint.tokenizer
+        image = torch.from_numpy(np.array(observation.image))[None]
+        prompt = torch.tensor([tokenizer.prompt(observation.instruction)])
         completion = generate(
             self.checkpoint.network,
-            torch.from_numpy(np.array(image))[None],
-            torch.tensor([tokenizer.prompt(instruction)]),
+            image.expand(draw.candidates, -1, -1, -1),
+            prompt.expand(draw.candidates, -1),
             COMPLETION_TOKENS,
-            self.temperature,
-            self.generator,
+            draw.temperature,
+            torch.Generator().manual_seed(draw.seed),
         ).numpy()
         actions, well_formed = decode(self.checkpoint, completion)
-        if not well_formed[0]:
-            got = completion[0, -1 - DIMENSIONS :]
-            raise ValueError(f"expected {DIMENSIONS} action tokens and the end, got {got}")
-        result: NDArray[np.float32] = actions[0].astype(np.float32)
-        return result
+        return [
+            action[None].astype(np.float32)
+            if is_right
+            else f"expected {DIMENSIONS} action tokens and the end, got {row[-1 - DIMENSIONS :]}"
+            for action, is_right, row in zip(actions, well_formed, completion, strict=True)
+        ]
 
 
-def serve_vla_eval(policy: Policy, port: int) -> None:
-    """vla-eval's own model server; sessions and episodes are its business."""
-    from vla_eval.model_servers.predict import PredictModelServer
-    from vla_eval.model_servers.serve import serve
-    from vla_eval.specs import IMAGE_RGB, LANGUAGE, POSITION_DELTA, ROTATION_AA, DimSpec
+class FlowPolicy:
+    """A network that integrates noise to a chunk of actions, `model_type` rever-flow."""
 
-    class Server(PredictModelServer):
-        def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
-            return {"actions": policy.act(obs["images"]["primary"], obs["task_description"])}
+    def __init__(self, folder: Path) -> None:
+        self.policy = flow.read(folder)
+        side = self.policy.network.config.vision.image_size
+        self.description = describe(folder, 1.0, side, self.policy.statistics)
 
-        def get_action_spec(self) -> dict[str, Any]:
-            gripper = DimSpec("gripper", 1, "binary_close_negative", (-1, 1))
-            return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": gripper}
-
-        def get_observation_spec(self) -> dict[str, Any]:
-            return {"image": IMAGE_RGB, "language": LANGUAGE}
-
-    serve(Server(), host=LOOPBACK, port=port)
-
-
-async def serve_openpi(policy: Policy, port: int) -> None:
-    """openpi's protocol: metadata, then one result per observation; a text frame is an error."""
-    from openpi_client import msgpack_numpy
-    from websockets.asyncio.server import ServerConnection, serve
-
-    async def answer(connection: ServerConnection) -> None:
-        await connection.send(msgpack_numpy.packb({"model": "bridge-small in PyTorch"}))
-        async for frame in connection:
-            observation = msgpack_numpy.unpackb(frame)
-            try:
-                action = policy.act(observation["observation/image"], observation["prompt"])
-            except (KeyError, ValueError):
-                await connection.send(traceback.format_exc())
-                await connection.close(1011, "the policy failed")
-                return
-            await connection.send(msgpack_numpy.packb({"actions": action[None]}))
-
-    async with serve(answer, LOOPBACK, port, compression=None, max_size=None) as server:
-        await server.serve_forever()
+    def act(self, observation: Observation, draw: Draw) -> list[Candidate]:
+        """(chunk, 7) each: metres, rotation vector, gripper +1 open and -1 closed."""
+        check_image(observation, self.description)
+        if observation.state.shape != (flow.STATE_NUMBERS,):
+            expected, got = flow.STATE_NUMBERS, observation.state.size
+            raise ValueError(f"state: expected {expected} numbers, got {got}")
+        longest = self.policy.network.config.prompt
+        tokens = len(self.policy.tokenizer.prompt(observation.instruction))
+        if tokens > longest:
+            raise ValueError(
+                f"instruction: expected at most {longest} tokens, got {tokens}: "
+                f"{observation.instruction!r}"
+            )
+        chunks = self.policy.act(
+            torch.from_numpy(np.array(observation.image)),
+            torch.from_numpy(np.array(observation.state)),
+            observation.instruction,
+            draw.candidates,
+            draw.temperature,
+            torch.Generator().manual_seed(draw.seed),
+        )
+        return [world_from_model(chunk.double().numpy()).astype(np.float32) for chunk in chunks]
 
 
-def main() -> None:
+KINDS: dict[str, type[TokenPolicy] | type[FlowPolicy]] = {
+    "openvla": TokenPolicy,
+    "rever-flow": FlowPolicy,
+}
+
+
+def describe(folder: Path, temperature: float, side: int, statistics: Statistics) -> Description:
+    """Both kinds are deterministic at temperature 0, and unscale actions by their quantiles."""
+    spans = np.array(statistics.q99[:-1]) - np.array(statistics.q01[:-1])
+    return Description(
+        name=folder.resolve().name,
+        digest=policy_server.digest_of(folder, FILES),
+        temperature=temperature,
+        is_greedy=True,
+        image_size=(side, side),
+        action_scale=[*spans.tolist(), GRIPPER_SPAN],
+    )
+
+
+def check_image(observation: Observation, description: Description) -> None:
+    expected = (*description.image_size, 3)
+    if observation.image.shape != expected:
+        raise ValueError(f"image: expected {expected}, got {observation.image.shape}")
+
+
+def read(folder: Path) -> TokenPolicy | FlowPolicy:
+    """Loads a checkpoint of either kind. Raises ValueError for another kind."""
+    missing = [name for name in FILES if not (folder / name).is_file()]
+    if missing:
+        raise ValueError(f"{folder}: expected {', '.join(FILES)}; missing: {', '.join(missing)}")
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    model_type = config.get("model_type")
+    if model_type not in KINDS:
+        expected = " or ".join(KINDS)
+        raise ValueError(f"{folder}/config.json: expected model_type {expected}, got {model_type}")
+    return KINDS[model_type](folder)
+
+
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--model", type=Path, required=True)
-    parser.add_argument("--wire", choices=["vla-eval", "openpi"], required=True)
-    parser.add_argument("--port", type=int, default=8001)
-    parser.add_argument("--temperature", type=float, default=0.0)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--model", type=Path, required=True, help="folder of the checkpoint")
+    policy_server.Options.declare(parser)
     arguments = parser.parse_args()
-    policy = Policy(arguments.model, arguments.temperature, arguments.seed)
-    if arguments.wire == "vla-eval":
-        serve_vla_eval(policy, arguments.port)
-    else:
-        asyncio.run(serve_openpi(policy, arguments.port))
+    options = policy_server.Options.of(arguments)
+    torch.set_num_threads(options.threads)
+    try:
+        policy = read(arguments.model)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    policy_server.serve(policy, options)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
