@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import hashlib
 import random
 from collections.abc import Mapping
@@ -25,6 +26,8 @@ from numpy.typing import NDArray
 
 LOOPBACK = "127.0.0.1"
 CANDIDATES_MAX = 64
+# The client's limit.
+CHUNK_MAX = 1024
 CLIENTS_MAX = 256
 FRAME_BYTES_MAX = 16 * 1024 * 1024
 SEED_MAX = 2**64 - 1
@@ -201,16 +204,16 @@ class Responder:
 
 def serve(policy: Policy, options: Options) -> None:
     """Serves until the process is ended."""
-    if options.wire == "vla-eval":
-        serve_vla_eval(Responder(policy, options))
-    else:
-        asyncio.run(serve_openpi(Responder(policy, options)))
+    wires = {"openpi": serve_openpi, "vla-eval": serve_vla_eval}
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(wires[options.wire](Responder(policy, options)))
 
 
 async def serve_openpi(responder: Responder) -> None:
     """openpi's protocol: metadata, then one result per observation; a text frame is an error."""
     from openpi_client import msgpack_numpy
     from websockets.asyncio.server import ServerConnection, serve
+    from websockets.exceptions import ConnectionClosed
 
     description, options = responder.policy.description, responder.options
 
@@ -226,6 +229,11 @@ async def serve_openpi(responder: Responder) -> None:
         if len(server.connections) > CLIENTS_MAX:
             await connection.close(1013, f"expected at most {CLIENTS_MAX} clients")
             return
+        # A client may leave without a word.
+        with contextlib.suppress(ConnectionClosed):
+            await converse(connection)
+
+    async def converse(connection: ServerConnection) -> None:
         await connection.send(msgpack_numpy.packb(description.metadata()))
         async for frame in connection:
             try:
@@ -245,10 +253,11 @@ async def serve_openpi(responder: Responder) -> None:
             await server.serve_forever()
 
 
-def serve_vla_eval(responder: Responder) -> None:
+async def serve_vla_eval(responder: Responder) -> None:
     """vla-eval's own model server, which keeps sessions and plays the chunks."""
+    import anyio
     from vla_eval.model_servers.predict import PredictModelServer
-    from vla_eval.model_servers.serve import serve
+    from vla_eval.model_servers.serve import serve_async
     from vla_eval.specs import IMAGE_RGB, LANGUAGE, POSITION_DELTA, ROTATION_AA, DimSpec
 
     class Server(PredictModelServer):
@@ -266,9 +275,11 @@ def serve_vla_eval(responder: Responder) -> None:
         def get_observation_spec(self) -> dict[str, Any]:
             return {"image": IMAGE_RGB, "language": LANGUAGE}
 
-    # More than any chunk has: the buffer plays what it gets.
-    server = Server(chunk_size=responder.options.chunk or 1024)
-    serve(server, host=LOOPBACK, port=responder.options.port)
+    description, options = responder.policy.description, responder.options
+    server = Server(chunk_size=options.chunk or CHUNK_MAX)
+    async with anyio.create_task_group() as group:
+        place = await group.start(serve_async, server, LOOPBACK, options.port)
+        print(f"serving {description.name} at vla-eval://{LOOPBACK}:{place}", flush=True)
 
 
 def digest_of(folder: Path, names: list[str]) -> str:
