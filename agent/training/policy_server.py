@@ -221,7 +221,7 @@ async def serve_openpi(responder: Responder) -> None:
         try:
             fields = msgpack_numpy.unpackb(frame)
         except (ValueError, TypeError) as error:
-            raise ValueError(f"observation: expected a MessagePack map: {error}") from error
+            raise ValueError(f"observation: expected a MessagePack map: {error!r}") from error
         result: bytes = msgpack_numpy.packb(responder.openpi(fields))
         return result
 

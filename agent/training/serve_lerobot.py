@@ -12,6 +12,7 @@ Needs lerobot 0.4, and what policy_server.py needs.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ class LerobotPolicy:
     """A policy with its processors."""
 
     def __init__(self, folder: Path, image_key: str | None) -> None:
+        names = files(folder)
         config = PreTrainedConfig.from_pretrained(folder)
         config.device = DEVICE
         if config.n_obs_steps != 1:
@@ -58,7 +60,7 @@ class LerobotPolicy:
         _, height, width = images[self.image_key]
         self.description = Description(
             name=f"{config.type} of LeRobot {lerobot_version}",
-            digest=policy_server.digest_of(folder, files(folder)),
+            digest=policy_server.digest_of(folder, names),
             temperature=TEMPERATURE,
             is_greedy=False,
             image_size=(height, width),
@@ -121,10 +123,12 @@ def choose(image_key: str | None, keys: list[str]) -> str:
 
 def files(folder: Path) -> list[str]:
     """The names of the files that determine what the policy computes."""
-    found = [path.name for path in folder.iterdir() if path.suffix in (".json", ".safetensors")]
-    if "config.json" not in found:
+    config = folder / "config.json"
+    if not config.is_file():
         raise ValueError(f"{folder}: expected config.json of a LeRobot policy, got none")
-    return found
+    if "type" not in json.loads(config.read_text(encoding="utf-8")):
+        raise ValueError(f"{config}: expected the type of a LeRobot policy, got no type")
+    return [path.name for path in folder.iterdir() if path.suffix in (".json", ".safetensors")]
 
 
 def main() -> int:
