@@ -2,11 +2,12 @@
 //! own packages execute the same chunks.
 
 use std::path::Path;
+use std::process::Command;
 
-use store::record::{DecisionRecord, EpisodeRecord};
+use store::record::{CandidateRecord, DecisionRecord, EpisodeRecord};
 
 use crate::evaluation::Evaluation;
-use crate::harness::{ReadyProgram, peers, repository, rever, run, text};
+use crate::harness::{ReadyProgram, peers, python, repository, rever, run, text};
 
 const TASK: &str = "widowx_stack_cube";
 /// Actions of a chunk.
@@ -44,9 +45,19 @@ fn evaluate(folder: &Path, name: &str, arguments: &[&str]) -> Vec<EpisodeRecord>
     records
 }
 
-/// A decision without its times.
-fn untimed(decision: &DecisionRecord) -> DecisionRecord {
-    DecisionRecord { batch_ms: 0.0, batch_size: 0, ..decision.clone() }
+/// A decision without its times, and without what only records of a policy server hold.
+fn comparable(decision: &DecisionRecord) -> DecisionRecord {
+    let mut decision = DecisionRecord { batch_ms: 0.0, batch_size: 0, ..decision.clone() };
+    decision.candidates.iter_mut().for_each(|candidate| candidate.said = None);
+    decision
+}
+
+/// Runs a command to its end and returns what it said.
+fn said(command: &mut Command, code: i32) -> String {
+    let output = run(command);
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(code), "{command:?}: {said}");
+    said
 }
 
 #[test]
@@ -67,7 +78,11 @@ fn the_served_agent_decides_as_the_local_one_bit_by_bit() {
             assert_eq!(served.steps.len(), local.steps.len(), "{}", local.identity.id());
             for (step, (served, local)) in served.steps.iter().zip(&local.steps).enumerate() {
                 let (served, local) = (served.decision.as_ref(), local.decision.as_ref());
-                assert_eq!(served.map(untimed), local.map(untimed), "{wire}: step {step}");
+                let decisions = (served.map(comparable), local.map(comparable));
+                assert_eq!(decisions.0, decisions.1, "{wire}: step {step}");
+                let candidates = served.iter().flat_map(|decision| &decision.candidates);
+                let read = |one: &CandidateRecord| one.said.is_some() == one.actions.is_some();
+                assert!(candidates.clone().all(read), "{wire}: step {step}: what the server said");
             }
         }
     }
@@ -109,6 +124,66 @@ fn a_chunk_is_the_same_whether_client_or_server_keeps_it() {
 }
 
 #[test]
+fn a_verifier_is_trained_on_what_a_backbone_reads_of_a_policy_server() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = |name: &str| folder.path().join(name);
+    let server = of_rever();
+    let policy = format!("--policy=openpi://{}", place(&server));
+    let python = format!("--python={}", python().python.display());
+    let on_server = |command: &str, run: &str, more: &[&str]| {
+        let mut program = rever();
+        program.args([command, &policy, &python, "--sessions=2"]).args(more);
+        program.arg("--out").arg(file(run)).arg("--labels").arg(file("labels.sqlite"));
+        program
+    };
+    let read = ["--backbone=included", "--candidates=3"];
+    said(&mut on_server("collect", "labels", &[&read[..], &["--episodes=6"]].concat()), 0);
+    let ids = store::run::recorded(&file("labels")).expect("records");
+    assert_eq!(ids.len(), 24);
+    for id in &ids {
+        let path = store::run::record_path(&file("labels"), id);
+        let record = EpisodeRecord::read(&path).expect("a record");
+        for candidate in record.decisions().flat_map(|decision| &decision.candidates) {
+            let Some(said) = &candidate.said else { continue };
+            assert_eq!(candidate.hidden.as_ref().map(Vec::len), Some(2 * 256), "{id}");
+            assert_eq!((said.confidence.len(), said.reasoning.task.is_empty()), (16, false));
+        }
+    }
+    let verifier = file("verifier.safetensors");
+    let mut train = rever();
+    train.arg("train").arg(file("labels")).arg("--epochs=2").arg("--out").arg(&verifier);
+    let trained = said(&mut train, 0);
+    let next = "next: rever evaluate --policy openpi://HOST:PORT --policy-profile rever --backbone included";
+    assert!(trained.contains(next), "{trained}");
+    let named = format!("--verifier={}", verifier.display());
+    let one = ["--tasks=stack_cube", "--strategies=verifier", "--episodes=1", &named];
+    said(&mut on_server("evaluate", "run", &[&read[..], &one].concat()), 0);
+    let scores = said(rever().arg("report").arg(file("run")).arg(&named), 0);
+    assert!(scores.contains("1 with steps"), "{scores}");
+    let step = std::fs::read_dir(file("run/report/data")).expect("a report").flatten();
+    let step = step.map(|entry| std::fs::read_to_string(entry.path()).expect("a script"));
+    assert!(!step.collect::<String>().contains("terms of the scores are not shown"));
+    // Without the backbone the candidates are another policy's.
+    let other = said(&mut on_server("evaluate", "other", &one), 2);
+    assert!(other.contains("policy"), "{other}");
+    assert!(!file("other").exists(), "nothing was started");
+}
+
+#[test]
+fn episodes_without_hidden_states_train_no_verifier() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let server = of_peer("openpi");
+    let policy = format!("--policy=openpi://{}", place(&server));
+    let out = folder.path().join("labels");
+    let mut collect = rever();
+    collect.args(["collect", &policy, "--episodes=1", "--tasks=stack_cube"]);
+    collect.arg(format!("--python={}", python().python.display())).arg("--out").arg(&out);
+    said(collect.arg("--labels").arg(folder.path().join("labels.sqlite")), 0);
+    let refused = said(rever().arg("train").arg(&out), 2);
+    assert!(refused.contains("--backbone included"), "{refused}");
+}
+
+#[test]
 fn what_a_policy_server_cannot_do_is_refused_before_anything_starts() {
     let server = of_peer("openpi");
     let policy = format!("--policy=openpi://{}", place(&server));
@@ -129,6 +204,8 @@ fn what_a_policy_server_cannot_do_is_refused_before_anything_starts() {
             "--unnorm-key a: expected a checkpoint's folder",
         ),
         (vec!["train", &policy], "expected a checkpoint's folder, got the policy server"),
+        (vec!["evaluate", "--backbone=included"], "--backbone: expected a policy server"),
+        (vec!["evaluate", &policy, "--backbone=no/where"], "--backbone: expected a checkpoint's"),
         (vec!["evaluate", "--policy-profile=bridge"], "--policy-profile: expected a policy server"),
         (vec!["evaluate", &nobody], "policy server vla-eval://127.0.0.1:1: cannot connect"),
         (vec!["evaluate", "--policy=ws://127.0.0.1:1"], "which of the two does the server speak?"),

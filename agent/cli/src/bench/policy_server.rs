@@ -123,6 +123,7 @@ impl PolicyServerBench<'_> {
     /// Starts a server on a free port and connects a client.
     async fn start(&self, wire: usize, stopped: watch::Receiver<bool>) -> Result<Socket> {
         let agent = ServedAgent::start(AgentOptions {
+            candidates_max: 0,
             policy: Arc::clone(&self.policy),
             scorer: self.scorer(),
             setting: self.setting(),

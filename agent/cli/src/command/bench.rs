@@ -14,6 +14,7 @@ use runtime::servers::{Host, LocalSource, ServerSource, Simulator};
 
 use crate::bench::{self, SimulatorsBench, ThroughputBench, WireBench};
 use crate::build_info;
+use crate::command::cache;
 use crate::command::policy::PolicyArguments;
 use crate::files;
 
@@ -223,7 +224,14 @@ fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
     let verifier = loaded.verifier(arguments.verifier)?;
     let count = usize::from(arguments.servers);
     let servers = servers(host, count, arguments.simulator, arguments.python)?;
-    let sessions: Vec<usize> = arguments.sessions.iter().copied().map(usize::from).collect();
+    let PolicyArguments { device, kv_cache, .. } = arguments.policy;
+    let fitting = |&wanted: &u16| match &loaded.checkpoint {
+        Some(policy) => cache::sessions(policy, device, kv_cache, wanted, arguments.candidates),
+        None => Ok(wanted),
+    };
+    let sessions = arguments.sessions.iter().map(|wanted| fitting(wanted).map(usize::from));
+    let mut sessions: Vec<usize> = sessions.collect::<Result<_>>()?;
+    sessions.dedup();
     let bench = ThroughputBench {
         policy: loaded.policy,
         verifier,

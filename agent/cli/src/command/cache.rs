@@ -24,22 +24,47 @@ pub fn sessions(
     wanted: u16,
     candidates: u32,
 ) -> Result<u16> {
-    let bound = match given {
-        Some(gigabytes) => Bound::Given(gigabytes * 1e9),
-        None => match free_bytes(device) {
-            Some(free) => Bound::Free(free),
-            None => return Ok(wanted),
-        },
-    };
-    let each = policy.cache_bytes(candidates as usize)? as f64;
-    let (sessions, line) = fitting(bound, each, wanted, candidates)?;
+    let (sessions, line) = lowered(policy, device, given, wanted, candidates)?;
     if let Some(line) = line {
         eprintln!("{line}");
     }
     Ok(sessions)
 }
 
+/// The most candidates that a session may have, up to `most`: `own`, if more would lower the number of sessions.
+pub fn candidates(
+    policy: &Vla,
+    device: DeviceName,
+    given: Option<f64>,
+    wanted: u16,
+    (own, most): (u32, u32),
+) -> u32 {
+    let fits = |candidates| {
+        lowered(policy, device, given, wanted, candidates)
+            .is_ok_and(|(sessions, _)| sessions == wanted)
+    };
+    if most > own && fits(most) { most } else { own }
+}
+
 /// The number of sessions, and a line if it is smaller than `wanted`.
+fn lowered(
+    policy: &Vla,
+    device: DeviceName,
+    given: Option<f64>,
+    wanted: u16,
+    candidates: u32,
+) -> Result<(u16, Option<String>)> {
+    let bound = match given {
+        Some(gigabytes) => Bound::Given(gigabytes * 1e9),
+        None => match free_bytes(device) {
+            Some(free) => Bound::Free(free),
+            None => return Ok((wanted, None)),
+        },
+    };
+    fitting(bound, policy.cache_bytes(candidates as usize)? as f64, wanted, candidates)
+}
+
+/// As [`lowered`], for a session of `each` bytes.
 fn fitting(bound: Bound, each: f64, wanted: u16, candidates: u32) -> Result<(u16, Option<String>)> {
     let (bytes, source) = match bound {
         Bound::Given(bytes) => (bytes, "--kv-cache".to_owned()),

@@ -8,13 +8,14 @@ use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use decision::{Scorer, Setting, Strategy};
 use remote_policy::server::{
-    ActionForm, AgentOptions, ApiKey, Gripper, ObservationKeys, Rotation, ServedAgent,
-    ServerOptions, serve,
+    ActionForm, AgentOptions, ApiKey, CANDIDATES_MAX, Gripper, ObservationKeys, Rotation,
+    ServedAgent, ServerOptions, serve,
 };
 use runtime::servers::Host;
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
+use vla::Vla;
 
 use super::evaluate::temperature;
 use super::names::StrategyParser;
@@ -97,13 +98,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let verifier = loaded.verifier(arguments.verifier.clone())?;
     let setting = arguments.setting(verifier.is_some())?;
     loaded.policy.check(&setting).map_err(|error| WrongUsage(format!("{error:#}")))?;
-    let PolicyArguments { device, kv_cache, .. } = arguments.policy;
-    let wanted = arguments.max_clients;
-    let clients_max = match &loaded.checkpoint {
-        Some(policy) => cache::sessions(policy, device, kv_cache, wanted, setting.candidates)?,
-        None => wanted,
-    };
-    let clients_max = usize::from(clients_max);
+    let (clients_max, candidates_max) = arguments.limits(loaded.checkpoint.as_deref(), setting)?;
     let (seed, name) = (arguments.seed, loaded.name.clone());
     let form = ActionForm {
         rotation: match arguments.rotation {
@@ -120,6 +115,7 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
         policy: loaded.policy,
         scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
         setting,
+        candidates_max,
         seed,
         form,
         keys: ObservationKeys { camera: arguments.camera, state: arguments.state },
@@ -146,6 +142,17 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
 }
 
 impl Arguments {
+    /// How many clients, and how many candidates each may ask for.
+    fn limits(&self, policy: Option<&Vla>, setting: Setting) -> Result<(usize, u32)> {
+        let (wanted, own) = (self.max_clients, setting.candidates);
+        let most = own.max(CANDIDATES_MAX);
+        let Some(policy) = policy else { return Ok((usize::from(wanted), most)) };
+        let PolicyArguments { device, kv_cache, .. } = self.policy;
+        let most = cache::candidates(policy, device, kv_cache, wanted, (own, most));
+        let clients = cache::sessions(policy, device, kv_cache, wanted, most)?;
+        Ok((usize::from(clients), most))
+    }
+
     fn setting(&self, has_verifier: bool) -> Result<Setting> {
         let strategy = self.strategy.unwrap_or(match has_verifier {
             true => Strategy::Verifier,

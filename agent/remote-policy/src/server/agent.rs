@@ -12,8 +12,8 @@ use super::action_form::ActionForm;
 use super::observation::ObservationKeys;
 use crate::codec::extension::{Announcement, Ask};
 
-/// Maximum number of candidates that a client can ask for, unless the agent's own number is larger.
-const CANDIDATES_MAX: u32 = 16;
+/// Maximum number of candidates that a client can ask for where memory allows it.
+pub const CANDIDATES_MAX: u32 = 16;
 /// Maximum temperature that a client can ask for.
 const TEMPERATURE_MAX: f32 = 10.0;
 
@@ -25,6 +25,8 @@ pub struct AgentOptions {
     pub scorer: Option<Arc<dyn Scorer>>,
     /// How candidates are sampled and selected, unless a client asks otherwise.
     pub setting: Setting,
+    /// Maximum number of candidates that a client can ask for; at least those of the setting.
+    pub candidates_max: u32,
     /// The seed from which those of episodes are derived.
     pub seed: u64,
     /// The convention of the actions that are sent.
@@ -116,7 +118,7 @@ impl ServedAgent {
     }
 
     fn candidates_max(&self) -> u32 {
-        self.options.setting.candidates.max(CANDIDATES_MAX)
+        self.options.candidates_max.max(self.options.setting.candidates)
     }
 
     /// What this server adds to the wires.

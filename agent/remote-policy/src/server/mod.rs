@@ -23,7 +23,7 @@ mod session;
 mod vla_eval;
 
 pub use action_form::{ActionForm, Gripper, Rotation};
-pub use agent::{AgentOptions, ServedAgent};
+pub use agent::{AgentOptions, CANDIDATES_MAX, ServedAgent};
 pub use key::ApiKey;
 pub use listen::{MESSAGE_BYTES_MAX, ServerOptions, serve};
 pub use observation::ObservationKeys;

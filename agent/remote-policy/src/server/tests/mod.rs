@@ -23,7 +23,10 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::{WebSocketStream, client_async};
 
-use super::{ActionForm, AgentOptions, ApiKey, ObservationKeys, ServedAgent, ServerOptions, serve};
+use super::{
+    ActionForm, AgentOptions, ApiKey, CANDIDATES_MAX, ObservationKeys, ServedAgent, ServerOptions,
+    serve,
+};
 use crate::codec::{Array, Dtype, KeyForm, Value, decode, encode};
 
 /// No reply takes longer.
@@ -100,6 +103,7 @@ pub struct Server {
 
 pub fn agent(steps: usize, strategy: Strategy, candidates: u32) -> Arc<ServedAgent> {
     let options = AgentOptions {
+        candidates_max: CANDIDATES_MAX,
         policy: Arc::new(Echo::new(steps)),
         scorer: None,
         setting: Setting::new(strategy, candidates, 1.0),
