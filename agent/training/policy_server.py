@@ -41,7 +41,7 @@ Candidate = NDArray[np.float32] | str
 
 @dataclass(frozen=True)
 class Observation:
-    """What a client sees."""
+    """One observation of a client."""
 
     # (height, width, 3)
     image: NDArray[np.uint8]
@@ -72,7 +72,7 @@ class Draw:
 
     @classmethod
     def read(cls, fields: object, default: Draw) -> Draw:
-        """A client's wishes; what it leaves open is as in `default`. Raises ValueError."""
+        """The optional fields of a request; missing ones are as in `default`. Raises ValueError."""
         if not isinstance(fields, Mapping):
             raise ValueError(f"{FIELDS}: expected a map, got {kind(fields)}")
         candidates = fields.get("candidates", default.candidates)
@@ -229,7 +229,7 @@ async def serve_openpi(responder: Responder) -> None:
         if len(server.connections) > CLIENTS_MAX:
             await connection.close(1013, f"expected at most {CLIENTS_MAX} clients")
             return
-        # A client may leave without a word.
+        # A client may end its connection at any time.
         with contextlib.suppress(ConnectionClosed):
             await converse(connection)
 
