@@ -203,7 +203,7 @@ class Responder:
 
 
 def serve(policy: Policy, options: Options) -> None:
-    """Serves until the process is ended."""
+    """Serves until the process is ended. Prints a line that begins with `ready ws://HOST:PORT`."""
     wires = {"openpi": serve_openpi, "vla-eval": serve_vla_eval}
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(wires[options.wire](Responder(policy, options)))
@@ -249,7 +249,7 @@ async def serve_openpi(responder: Responder) -> None:
         limits = {"compression": None, "max_size": FRAME_BYTES_MAX}
         async with serve(answer, LOOPBACK, options.port, **limits) as server:
             place = server.sockets[0].getsockname()[1]
-            print(f"serving {description.name} at openpi://{LOOPBACK}:{place}", flush=True)
+            print(f"ready ws://{LOOPBACK}:{place} openpi, {description.name}", flush=True)
             await server.serve_forever()
 
 
@@ -279,7 +279,7 @@ async def serve_vla_eval(responder: Responder) -> None:
     server = Server(chunk_size=options.chunk or CHUNK_MAX)
     async with anyio.create_task_group() as group:
         place = await group.start(serve_async, server, LOOPBACK, options.port)
-        print(f"serving {description.name} at vla-eval://{LOOPBACK}:{place}", flush=True)
+        print(f"ready ws://{LOOPBACK}:{place} vla-eval, {description.name}", flush=True)
 
 
 def digest_of(folder: Path, names: list[str]) -> str:
