@@ -1,7 +1,8 @@
 """A policy that follows its observations, behind vla-eval's model server or openpi's protocol.
 
-Usage: python tests/policy_server.py vla-eval|openpi CHUNK
+Usage: python tests/policy_server.py vla-eval|openpi|drawn CHUNK
 
+With `drawn` it is served by agent/training/policy_server.py, and its candidates differ by noise.
 Prints `ready PORT`. The policy plans CHUNK actions from an observation: it moves up and opens the
 gripper, at a speed that depends on the image and the state, so that another observation, another
 order or another session gives other actions.
@@ -9,6 +10,7 @@ order or another session gives other actions.
 
 import asyncio
 import sys
+from pathlib import Path
 from typing import Any
 
 import anyio
@@ -17,6 +19,10 @@ from openpi_client import msgpack_numpy
 from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.model_servers.serve import serve_async
 from websockets.asyncio.server import ServerConnection, serve
+
+# First: this file has the same name.
+sys.path.insert(0, str(Path(__file__).parent.parent / "agent/training"))
+import policy_server as served
 
 LOOPBACK = "127.0.0.1"
 
@@ -37,6 +43,30 @@ class Server(PredictModelServer):
         return {
             "actions": plan(obs["images"]["primary"], obs["states"], self.chunk_size)
         }
+
+
+class Drawn:
+    """Candidates whose speed depends on the seed and the temperature."""
+
+    description = served.Description("scripted", "0" * 64, 1.0, True, (64, 64), None)
+
+    def __init__(self, chunk: int) -> None:
+        self.chunk = chunk
+
+    def act(
+        self, observation: served.Observation, draw: served.Draw
+    ) -> list[served.Candidate]:
+        planned = plan(observation.image, observation.state, self.chunk)
+        generator = np.random.default_rng(draw.seed)
+        noise = draw.temperature * generator.normal(0, 0.002, (draw.candidates, 3))
+        candidates = np.tile(planned, (draw.candidates, 1, 1))
+        candidates[:, :, :3] += noise[:, None]
+        return list(candidates)
+
+
+async def serve_drawn(chunk: int) -> None:
+    options = served.Options("openpi", 0, 0, None, None, 1)
+    await served.serve_openpi(served.Responder(Drawn(chunk), options))
 
 
 async def serve_vla_eval(chunk: int) -> None:
@@ -64,7 +94,9 @@ async def serve_openpi(chunk: int) -> None:
 
 if __name__ == "__main__":
     asyncio.run(
-        {"vla-eval": serve_vla_eval, "openpi": serve_openpi}[sys.argv[1]](
-            int(sys.argv[2])
-        )
+        {
+            "vla-eval": serve_vla_eval,
+            "openpi": serve_openpi,
+            "drawn": serve_drawn,
+        }[sys.argv[1]](int(sys.argv[2]))
     )

@@ -124,6 +124,29 @@ fn a_chunk_is_the_same_whether_client_or_server_keeps_it() {
 }
 
 #[test]
+fn candidates_of_a_server_in_python_do_not_depend_on_the_other_requests() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let server = of_peer("drawn");
+    let policy = format!("--policy=openpi://{}", place(&server));
+    let episodes = |name: &str, strategies: &str| {
+        evaluate(folder.path(), name, &["--candidates=3", "--seed=5", &policy, strategies])
+    };
+    let alone = episodes("alone", "--strategies=medoid").remove(0);
+    let among = episodes("among", "--strategies=greedy,sample,medoid");
+    let same = among.iter().find(|record| record.identity.id() == alone.identity.id());
+    let same = same.expect("the same episode");
+    assert_eq!(alone.steps.len(), same.steps.len());
+    for (step, (alone, same)) in alone.steps.iter().zip(&same.steps).enumerate() {
+        let (alone, same) = (alone.decision.as_ref(), same.decision.as_ref());
+        assert_eq!(alone.map(comparable), same.map(comparable), "step {step}");
+        assert_eq!(alone.is_some(), step % CHUNK == 0, "step {step}");
+        let Some(decision) = alone else { continue };
+        assert_eq!(decision.candidates.len(), 3);
+        assert_ne!(decision.candidates[0].actions, decision.candidates[1].actions);
+    }
+}
+
+#[test]
 fn a_verifier_is_trained_on_what_a_backbone_reads_of_a_policy_server() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = |name: &str| folder.path().join(name);

@@ -26,10 +26,14 @@ const DOCUMENTS: [&str; 5] = [
 const NOT_LISTED: [&str; 3] = [".gitignore", ".dockerignore", ".gitattributes"];
 /// Commands that this test does not run: they compile, install, download or need another machine. An entry that ends with a
 /// space is the beginning of a command.
-const NOT_RUN: [&str; 20] = [
+const NOT_RUN: [&str; 24] = [
     "(cd env-server && python -m pytest)",
+    ".venv/lerobot/bin/pip install ",
+    ".venv/lerobot/bin/python agent/training/",
     ".venv/openvla/bin/pip install ",
     ".venv/openvla/bin/python agent/training/reference.py ",
+    ".venv/serve/bin/pip install ",
+    ".venv/serve/bin/python agent/training/",
     "cargo install --path agent/cli",
     "cargo install --path agent/cli --features cuda",
     "cargo test --release --workspace",

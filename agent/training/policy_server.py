@@ -41,7 +41,7 @@ Candidate = NDArray[np.float32] | str
 
 @dataclass(frozen=True)
 class Observation:
-    """What a client sees."""
+    """One observation of a client."""
 
     # (height, width, 3)
     image: NDArray[np.uint8]
@@ -72,7 +72,7 @@ class Draw:
 
     @classmethod
     def read(cls, fields: object, default: Draw) -> Draw:
-        """A client's wishes; what it leaves open is as in `default`. Raises ValueError."""
+        """The optional fields of a request; missing ones are as in `default`. Raises ValueError."""
         if not isinstance(fields, Mapping):
             raise ValueError(f"{FIELDS}: expected a map, got {kind(fields)}")
         candidates = fields.get("candidates", default.candidates)
@@ -203,7 +203,7 @@ class Responder:
 
 
 def serve(policy: Policy, options: Options) -> None:
-    """Serves until the process is ended."""
+    """Serves until the process is ended. Prints a line that begins with `ready ws://HOST:PORT`."""
     wires = {"openpi": serve_openpi, "vla-eval": serve_vla_eval}
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(wires[options.wire](Responder(policy, options)))
@@ -229,7 +229,7 @@ async def serve_openpi(responder: Responder) -> None:
         if len(server.connections) > CLIENTS_MAX:
             await connection.close(1013, f"expected at most {CLIENTS_MAX} clients")
             return
-        # A client may leave without a word.
+        # A client may end its connection at any time.
         with contextlib.suppress(ConnectionClosed):
             await converse(connection)
 
@@ -249,7 +249,7 @@ async def serve_openpi(responder: Responder) -> None:
         limits = {"compression": None, "max_size": FRAME_BYTES_MAX}
         async with serve(answer, LOOPBACK, options.port, **limits) as server:
             place = server.sockets[0].getsockname()[1]
-            print(f"serving {description.name} at openpi://{LOOPBACK}:{place}", flush=True)
+            print(f"ready ws://{LOOPBACK}:{place} openpi, {description.name}", flush=True)
             await server.serve_forever()
 
 
@@ -279,7 +279,7 @@ async def serve_vla_eval(responder: Responder) -> None:
     server = Server(chunk_size=options.chunk or CHUNK_MAX)
     async with anyio.create_task_group() as group:
         place = await group.start(serve_async, server, LOOPBACK, options.port)
-        print(f"serving {description.name} at vla-eval://{LOOPBACK}:{place}", flush=True)
+        print(f"ready ws://{LOOPBACK}:{place} vla-eval, {description.name}", flush=True)
 
 
 def digest_of(folder: Path, names: list[str]) -> str:
