@@ -55,6 +55,7 @@ class FlowConfig:
 
     @classmethod
     def from_json(cls, value: dict[str, object]) -> FlowConfig:
+        value = dict(value)
         vision = value.pop("vision")
         assert isinstance(vision, dict)
         return cls(vision=TowerConfig(**vision), **value)  # type: ignore[arg-type]
