@@ -94,6 +94,7 @@ fn rollout(network: &Network, wait: Duration, kept: &Kept) -> Rollout<ZenohPool>
         sinks: Sinks::start(vec![Box::new(kept.clone())]).expect("a thread"),
         sessions: 3,
         options: RecordOptions::default(),
+        needs_well_formed: true,
         versions: versions(),
         stop,
     }

@@ -2,29 +2,35 @@
 # Checks a machine with an NVIDIA GPU: builds with CUDA, compares the CPU kernels and the card with OpenVLA's
 # packages, times a 7B checkpoint, and writes a report.
 #
-#   agent/training/gpu_check.sh --python PYTHON [--device cuda] [--size 7b] [--out runs/gpu-check]
+#   agent/training/gpu_check.sh --python PYTHON [--device cuda] [--size 7b] [--out runs/gpu-check] [--rever FILE]
 #
 # PYTHON has the packages of requirements-reference.lock and PyTorch. The 7B checkpoint takes 15 GB of disk,
 # 17 GB of memory and 16 GB on the card. `--device cpu --size small` runs the same lines without a GPU.
+# `--rever FILE` takes a program that is already built.
 set -euo pipefail
 
-python=python3 device=cuda size=7b out=runs/gpu-check
+python=python3 device=cuda size=7b out=runs/gpu-check rever=
+usage() {
+  echo "usage: $0 [--python FILE] [--device cpu|cuda|cuda:N] [--size small|real-towers|7b] [--out FOLDER] [--rever FILE]" >&2
+  exit 2
+}
 while (($#)); do
+  if (($# < 2)); then usage; fi
   case $1 in
     --python) python=$2 ;;
     --device) device=$2 ;;
     --size) size=$2 ;;
     --out) out=$2 ;;
-    *)
-      echo "usage: $0 [--python FILE] [--device cpu|cuda|cuda:N] [--size small|real-towers|7b] [--out FOLDER]" >&2
-      exit 2
-      ;;
+    --rever) rever=$2 ;;
+    *) usage ;;
   esac
   shift 2
 done
 mkdir -p "$out"
 out=$(cd "$out" && pwd)
-if [[ $python == */* ]]; then python=$(cd "$(dirname "$python")" && pwd)/$(basename "$python"); fi
+absolute() { echo "$(cd "$(dirname "$1")" && pwd)/$(basename "$1")"; }
+if [[ $python == */* ]]; then python=$(absolute "$python"); fi
+if [[ -n $rever ]]; then rever=$(absolute "$rever"); fi
 cd "$(dirname "$0")/../.."
 reference=agent/training/reference.py
 features=()
@@ -37,8 +43,10 @@ else
 fi
 
 echo "1. build"
-cargo build --release --workspace --bin rever "${features[@]}"
-rever=target/release/rever
+if [[ -z $rever ]]; then
+  cargo build --release --workspace --bin rever "${features[@]}"
+  rever=target/release/rever
+fi
 
 status=0
 # Compares one checkpoint with OpenVLA's packages on one device.

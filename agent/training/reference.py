@@ -205,9 +205,8 @@ def fit(model: nn.Module, kind: Kind, images: list[Tensor], tokenizer: LlamaToke
     examples = []
     with torch.no_grad():
         for image, prompt, ids in zip(images, prompts, targets, strict=True):
-            positions = embed(model, image, [*prompt, *ids], kind.fused).shape[1] - len(prompt)
-            patches = positions - len(ids)
             rows = embed(model, image, prompt, kind.fused)
+            patches = rows.shape[1] - len(prompt)
             examples.append((rows[:, 1 : 1 + patches], prompt, ids))
     decoder = model.language_model
     used = torch.tensor(sorted({token for ids in targets for token in ids}))

@@ -220,6 +220,7 @@ impl Experiment {
             sinks: Sinks::start(sinks)?,
             sessions: self.sessions,
             options: self.record,
+            needs_well_formed: true,
             versions: self.versions.clone(),
             stop: stop.clone(),
         };

@@ -82,7 +82,8 @@ pub struct Comparison {
 pub struct Report {
     /// The results of rever, one row per setting; the first is greedy.
     pub rows: Vec<Row>,
-    /// Bandwidth at which all threads read a buffer as large as a step's weights; of a local checkpoint.
+    /// Bandwidth at which all threads read a buffer as large as a step's weights, at most 1 GiB; of a
+    /// local checkpoint.
     pub bandwidth_bytes_per_second: Option<f64>,
     /// The strategy that compares the candidates: `verifier`, or `medoid` without a verifier.
     pub strategy: String,

@@ -121,6 +121,8 @@ impl ThroughputBench<'_> {
             ])?,
             sessions,
             options: RecordOptions::default(),
+            // Random weights are timed, too.
+            needs_well_formed: false,
             versions: build_info::record_versions(),
             stop,
         };

@@ -31,14 +31,18 @@ pub struct FirstDecisions {
 enum State {
     /// No candidate was well formed.
     Unproven { decisions: usize, first: Option<String> },
-    /// One was.
+    /// One was, or none has to be.
     Proven,
 }
 
 impl FirstDecisions {
-    /// The state at the start of a run.
-    pub fn new() -> FirstDecisions {
-        FirstDecisions { state: Mutex::new(State::Unproven { decisions: 0, first: None }) }
+    /// The state at the start of a run. If it needs no well-formed candidate, no decision is an error.
+    pub fn new(needs_well_formed: bool) -> FirstDecisions {
+        let state = match needs_well_formed {
+            true => State::Unproven { decisions: 0, first: None },
+            false => State::Proven,
+        };
+        FirstDecisions { state: Mutex::new(state) }
     }
 
     /// Notes one decision. Returns an error once too many decisions had no well-formed candidate.
@@ -85,7 +89,7 @@ mod tests {
     #[test]
     fn a_policy_that_is_never_well_formed_is_stopped_after_its_first_decisions() {
         let (policy, malformed) = (ScriptedPolicy::new(), candidate(None).expect("a candidate"));
-        let first = FirstDecisions::new();
+        let first = FirstDecisions::new(true);
         for _ in 1..DECISIONS_MAX {
             first.note(std::slice::from_ref(&malformed), &policy).expect("not yet");
         }
@@ -98,10 +102,19 @@ mod tests {
     fn one_well_formed_candidate_is_enough() {
         let policy = ScriptedPolicy::new();
         let [malformed, formed] = [None, Some(0.5)].map(|x| candidate(x).expect("a candidate"));
-        let first = FirstDecisions::new();
+        let first = FirstDecisions::new(true);
         first.note(&[malformed.clone(), formed], &policy).expect("well formed");
         for _ in 0..2 * DECISIONS_MAX {
             first.note(std::slice::from_ref(&malformed), &policy).expect("it can be well formed");
+        }
+    }
+
+    #[test]
+    fn a_run_that_needs_no_well_formed_candidate_is_never_stopped() {
+        let (policy, malformed) = (ScriptedPolicy::new(), candidate(None).expect("a candidate"));
+        let first = FirstDecisions::new(false);
+        for _ in 0..2 * DECISIONS_MAX {
+            first.note(std::slice::from_ref(&malformed), &policy).expect("none is needed");
         }
     }
 }

@@ -62,6 +62,8 @@ pub struct Rollout<P> {
     pub sessions: usize,
     /// Optional content of records.
     pub options: RecordOptions,
+    /// End the run if no candidate of its first decisions is well formed. A benchmark runs on.
+    pub needs_well_formed: bool,
     /// The versions in records; simulator, policy and verifier are filled in.
     pub versions: Versions,
     /// Checked between episodes.
@@ -75,10 +77,11 @@ impl<P: SessionPool> Rollout<P> {
         let stop = self.stop.clone();
         let sessions = self.sessions;
         let batcher = DecisionBatcher::start(Arc::clone(&self.decider));
+        let first_decisions = FirstDecisions::new(self.needs_well_formed);
         let shared = Arc::new(Shared {
             rollout: self,
             batcher,
-            first_decisions: FirstDecisions::new(),
+            first_decisions,
             leased: AtomicUsize::new(0),
             returned: Notify::new(),
         });

@@ -87,6 +87,7 @@ fn stage(policy: ScriptedPolicy, pool: &ScriptedPool, tasks: &[&str], strategy: 
         sinks: Sinks::start(vec![Box::new(kept.clone())]).expect("a thread"),
         sessions: 2,
         options: RecordOptions::default(),
+        needs_well_formed: true,
         versions: crate::tests::versions(),
         stop: stopped,
     };

@@ -119,7 +119,7 @@ fn print(report: &Report) {
     if let (Some(network), Some(bandwidth)) = (network, report.bandwidth_bytes_per_second) {
         let (megabytes, gigabytes) = (network.weight_bytes as f64 / 1e6, bandwidth / 1e9);
         println!(
-            "A token step reads {megabytes:.1} MB of weights; this machine reads a buffer of that size at {gigabytes:.1} GB/s."
+            "A token step reads {megabytes:.1} MB of weights; this machine reads a buffer of that size, or of 1 GiB, at {gigabytes:.1} GB/s."
         );
     }
     for one in &report.torch {
