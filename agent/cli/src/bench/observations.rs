@@ -8,6 +8,9 @@ use safetensors::tensor::Dtype;
 
 use decision::{Image, Observation};
 
+/// Numbers of a Bridge task's state. The recorded observations have none; times do not depend on it.
+const STATE_NUMBERS: usize = 8;
+
 /// Reads tensors `0.image`, `1.image`, … (height, width, 3) in u8, with metadata `observations` and `0.instruction`, ….
 pub fn read(file: &Path) -> Result<Vec<Observation>> {
     let read = || -> Result<Vec<Observation>> {
@@ -35,7 +38,12 @@ pub fn read(file: &Path) -> Result<Vec<Observation>> {
                 let instruction = metadata.get(&name);
                 let instruction =
                     instruction.with_context(|| format!("expected metadata {name}"))?.clone();
-                Ok(Observation { image, state: Vec::new(), instruction, expert_action: None })
+                Ok(Observation {
+                    image,
+                    state: vec![0.0; STATE_NUMBERS],
+                    instruction,
+                    expert_action: None,
+                })
             })
             .collect()
     };
