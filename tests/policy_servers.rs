@@ -48,7 +48,7 @@ fn evaluate(folder: &Path, name: &str, arguments: &[&str]) -> Vec<EpisodeRecord>
 /// A decision without its times, and without what only records of a policy server hold.
 fn comparable(decision: &DecisionRecord) -> DecisionRecord {
     let mut decision = DecisionRecord { batch_ms: 0.0, batch_size: 0, ..decision.clone() };
-    decision.candidates.iter_mut().for_each(|candidate| candidate.said = None);
+    decision.candidates.iter_mut().for_each(|candidate| candidate.reading = None);
     decision
 }
 
@@ -81,7 +81,7 @@ fn the_served_agent_decides_as_the_local_one_bit_by_bit() {
                 let decisions = (served.map(comparable), local.map(comparable));
                 assert_eq!(decisions.0, decisions.1, "{wire}: step {step}");
                 let candidates = served.iter().flat_map(|decision| &decision.candidates);
-                let read = |one: &CandidateRecord| one.said.is_some() == one.actions.is_some();
+                let read = |one: &CandidateRecord| one.reading.is_some() == one.actions.is_some();
                 assert!(candidates.clone().all(read), "{wire}: step {step}: what the server said");
             }
         }
@@ -167,9 +167,9 @@ fn a_verifier_is_trained_on_what_a_backbone_reads_of_a_policy_server() {
         let path = store::run::record_path(&file("labels"), id);
         let record = EpisodeRecord::read(&path).expect("a record");
         for candidate in record.decisions().flat_map(|decision| &decision.candidates) {
-            let Some(said) = &candidate.said else { continue };
+            let Some(reading) = &candidate.reading else { continue };
             assert_eq!(candidate.hidden.as_ref().map(Vec::len), Some(2 * 256), "{id}");
-            assert_eq!((said.confidence.len(), said.reasoning.task.is_empty()), (16, false));
+            assert_eq!((reading.confidence.len(), reading.reasoning.task.is_empty()), (16, false));
         }
     }
     let verifier = file("verifier.safetensors");

@@ -32,8 +32,8 @@ pub trait Policy: Send + Sync {
     /// Samples candidates for all requests; returns one proposal per request, in the same order.
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>>;
 
-    /// Refuses a setting that this policy cannot do, and says why. Every setting that is used is
-    /// checked before the first request with it.
+    /// Refuses a setting that this policy cannot do, and says why. What samples candidates checks its
+    /// settings with this before the first request.
     fn check(&self, _setting: &Setting) -> Result<()> {
         Ok(())
     }

@@ -93,7 +93,7 @@ pub struct DecisionRecord {
 }
 
 /// One sampled candidate. Its text is decoded from the tokens with the policy's tokenizer, or kept
-/// in `said` if the tokens are not those of a checkpoint.
+/// in `reading` if the policy is a policy server.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CandidateRecord {
@@ -117,15 +117,16 @@ pub struct CandidateRecord {
     /// for the executed candidate.
     #[serde(with = "serde_bytes")]
     pub hidden: Option<Vec<u8>>,
-    /// What cannot be decoded from the tokens; absent in every record of a checkpoint.
+    /// What the tokens do not give; absent in every record of a local checkpoint.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub said: Option<Said>,
+    pub reading: Option<Reading>,
 }
 
-/// What a policy server, or the backbone that reads its candidates, says of a well-formed candidate.
+/// What a policy server sends of a well-formed candidate beside its actions, or what the backbone
+/// reads of it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Said {
+pub struct Reading {
     /// Empty for a policy that acts without reasoning.
     pub reasoning: Reasoning,
     /// Token ids of the action's bins; empty if the policy has none.
@@ -199,7 +200,7 @@ pub(crate) mod tests {
             log_probability: -3.5,
             log_probabilities: vec![-1.0, -2.0, -0.5],
             hidden: Some(hidden_to_bytes(&[0.5, -2.0])),
-            said: None,
+            reading: None,
         };
         let malformed = CandidateRecord {
             actions: None,

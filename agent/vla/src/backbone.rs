@@ -6,6 +6,7 @@
 //! objects' positions) is then the backbone's; the actions remain the policy's.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context as _, Result, ensure};
 use async_trait::async_trait;
@@ -20,15 +21,16 @@ use crate::Vla;
 use crate::checkpoint::config::ACTION_LENGTH;
 
 /// A policy whose candidates are read by a backbone.
-pub struct ReadPolicy {
+pub struct BackbonePolicy {
     policy: Arc<dyn Policy>,
     backbone: Arc<Vla>,
     info: PolicyInfo,
+    is_unread_said: AtomicBool,
 }
 
-impl ReadPolicy {
+impl BackbonePolicy {
     /// Refuses a policy whose actions the backbone cannot read.
-    pub fn new(policy: Arc<dyn Policy>, backbone: Arc<Vla>) -> Result<ReadPolicy> {
+    pub fn new(policy: Arc<dyn Policy>, backbone: Arc<Vla>) -> Result<BackbonePolicy> {
         let (of_policy, own) = (policy.info(), backbone.info());
         let (expected, got) = (&own.action_space, &of_policy.action_space);
         ensure!(
@@ -48,22 +50,21 @@ impl ReadPolicy {
             parallel_calls: own.parallel_calls,
             ..of_policy.clone()
         };
-        Ok(ReadPolicy { policy, backbone, info })
+        Ok(BackbonePolicy { policy, backbone, info, is_unread_said: AtomicBool::new(false) })
     }
 
-    /// The candidates with what the backbone reads of them. Blocks the calling thread.
+    /// The candidates with what the backbone reads of them. `images` have the backbone's size. Blocks
+    /// the calling thread.
     fn read(
         &self,
         requests: &[ProposalRequest<'_>],
+        images: &[Image],
         proposals: Vec<Proposal>,
     ) -> Result<Vec<Proposal>> {
-        let size = self.backbone.info().image_size;
-        let images = requests.iter().map(|request| fit_image(request.image.clone(), size));
-        let images: Vec<Image> = images.collect::<Result<_>>()?;
         let actions = proposals.iter().map(|proposal| self.actions(proposal));
         let actions: Vec<Vec<[u32; ACTION_LENGTH]>> = actions.collect::<Result<_>>()?;
         let mut readings = Vec::with_capacity(requests.len());
-        for ((request, image), actions) in requests.iter().zip(&images).zip(&actions) {
+        for ((request, image), actions) in requests.iter().zip(images).zip(&actions) {
             let reading = ProposalRequest {
                 image,
                 candidates: actions.len(),
@@ -105,30 +106,51 @@ impl ReadPolicy {
         actions.map(|action| encode(action.actions.first())).collect()
     }
 
-    /// The policy's actions with the backbone's reading. A backbone that does not get to the action
-    /// has read nothing: the candidate has no tokens, and everything else is zero.
+    /// The policy's actions with the backbone's reading. If the backbone's reasoning does not get to
+    /// an action, it has read none of the decision's candidates, because they share the reasoning:
+    /// all have the same features, so that a verifier prefers none of them.
     fn merge(&self, candidate: &Candidate, reading: Candidate) -> Candidate {
         let Ok(parsed) = &candidate.parsed else { return candidate.clone() };
-        let Ok(Parsed { reasoning, .. }) = reading.parsed else {
-            return Candidate {
-                confidence: vec![0.0; TAGS.len() + ACTION_LENGTH],
-                hidden: vec![0.0; self.info.hidden_size.unwrap_or_default()],
-                ..candidate.clone()
-            };
+        let malformed = match reading.parsed {
+            Ok(Parsed { reasoning, .. }) => {
+                return Candidate { parsed: Ok(Parsed { reasoning, ..parsed.clone() }), ..reading };
+            }
+            Err(malformed) => malformed,
         };
-        Candidate { parsed: Ok(Parsed { reasoning, ..parsed.clone() }), ..reading }
+        if !self.is_unread_said.swap(true, Ordering::Relaxed) {
+            tracing::warn!(
+                "backbone: expected a reasoning and an action, got: {malformed}; the verifier cannot compare the \
+                 candidates of such a decision (this is said once)"
+            );
+        }
+        Candidate {
+            tokens: Vec::new(),
+            log_probability: 0.0,
+            log_probabilities: Vec::new(),
+            confidence: vec![0.0; TAGS.len() + ACTION_LENGTH],
+            hidden: vec![0.0; self.info.hidden_size.unwrap_or_default()],
+            parsed: candidate.parsed.clone(),
+        }
     }
 }
 
 #[async_trait]
-impl Policy for ReadPolicy {
+impl Policy for BackbonePolicy {
     fn info(&self) -> &PolicyInfo {
         &self.info
     }
 
     async fn propose(&self, requests: &[ProposalRequest<'_>]) -> Result<Vec<Proposal>> {
+        // What the backbone cannot read is refused before the server is asked: asking it again would
+        // move its chunks and histories on.
+        let size = self.backbone.info().image_size;
+        let mut images = Vec::with_capacity(requests.len());
+        for request in requests {
+            self.backbone.parser.prompter.ids(request.instruction)?;
+            images.push(fit_image(request.image.clone(), size)?);
+        }
         let proposals = self.policy.propose(requests).await?;
-        self.read(requests, proposals)
+        self.read(requests, &images, proposals)
     }
 
     /// What the policy can sample, whatever chooses: the backbone has what a verifier needs.

@@ -26,7 +26,7 @@ mod network;
 // Token generation: the decode loop, sampling, timing.
 mod generate;
 
-pub use backbone::ReadPolicy;
+pub use backbone::BackbonePolicy;
 pub use checkpoint::completion::CompletionParser;
 pub use checkpoint::options::{LoadOptions, ReasoningMode};
 pub use checkpoint::weights::Loaded;

@@ -80,7 +80,7 @@ pub struct Comparison {
 /// The results of one benchmark.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
-    /// The results of rever, one row per setting; the first is greedy.
+    /// The results of rever, one row per setting; the first is greedy, unless the policy cannot decode greedily.
     pub rows: Vec<Row>,
     /// Bandwidth at which all threads read a buffer as large as a step's weights, at most 1 GiB; of a
     /// local checkpoint.
@@ -88,7 +88,7 @@ pub struct Report {
     /// The strategy that compares the candidates: `verifier`, or `medoid` without a verifier.
     pub strategy: String,
     /// Median time of five compared candidates divided by that of one greedy candidate.
-    pub ratio_greedy: f64,
+    pub ratio_greedy: Option<f64>,
     /// Time of eager PyTorch divided by that of rever, at five candidates; only with a comparison.
     pub ratio_eager: Option<f64>,
     /// The same for the fastest PyTorch setting.
@@ -127,7 +127,7 @@ impl DecisionBench<'_> {
     /// Measures every setting of rever and of PyTorch, alternately.
     pub fn run(&self, mut torch: Option<Torch>, mut progress: impl FnMut(usize)) -> Result<Report> {
         ensure!(self.rounds > 0, "rounds: expected at least 1, got 0");
-        let settings = settings();
+        let settings = self.settings();
         let decider = Decider::new(Arc::clone(&self.policy));
         let hello = torch.as_ref().map(|torch| torch.hello.clone());
         let torch_settings = hello.as_ref().map(|hello| hello.settings.clone()).unwrap_or_default();
@@ -172,6 +172,12 @@ impl DecisionBench<'_> {
         self.report(&settings, ours, comparisons.collect(), hello)
     }
 
+    /// The greedy setting first, if the policy has one, then the sampled ones.
+    fn settings(&self) -> Vec<Setting> {
+        let greedy = self.policy.check(&EpisodeSetting::new(Strategy::Greedy, 1, 0.0)).is_ok();
+        greedy.then_some(GREEDY).into_iter().chain(CANDIDATES.map(sampled)).collect()
+    }
+
     /// The milliseconds of one decision, and the tokens of every candidate.
     fn decide(
         &self,
@@ -214,6 +220,7 @@ impl DecisionBench<'_> {
         let rows = rows.collect::<Result<Vec<Row>>>()?;
         let verified = rows.iter().find(|row| row.setting == sampled(CANDIDATES_DEFAULT));
         let verified = verified.context("five candidates are always timed")?.decision_ms_p50;
+        let greedy = rows.iter().find(|row| row.setting == GREEDY);
         let of_torch = |setting: Option<&str>| {
             torch
                 .iter()
@@ -224,7 +231,7 @@ impl DecisionBench<'_> {
         };
         let eager = torch_hello.as_ref().and_then(|hello| hello.settings.first());
         Ok(Report {
-            ratio_greedy: verified / rows[0].decision_ms_p50,
+            ratio_greedy: greedy.map(|row| verified / row.decision_ms_p50),
             ratio_eager: eager.and_then(|setting| of_torch(Some(setting))),
             ratio_best: of_torch(None),
             bandwidth_bytes_per_second: bandwidth,
@@ -310,11 +317,7 @@ pub fn compared(has_verifier: bool) -> Strategy {
     if has_verifier { Strategy::Verifier } else { Strategy::Medoid }
 }
 
-/// The greedy setting first, then the sampled ones.
-fn settings() -> Vec<Setting> {
-    let greedy = Setting { candidates: 1, temperature: 0.0 };
-    std::iter::once(greedy).chain(CANDIDATES.map(sampled)).collect()
-}
+const GREEDY: Setting = Setting { candidates: 1, temperature: 0.0 };
 
 fn sampled(candidates: usize) -> Setting {
     Setting { candidates, temperature: 1.0 }
@@ -351,7 +354,8 @@ mod tests {
         };
         let report = bench.run(None, |_| ()).expect("a report");
         let settings: Vec<Setting> = report.rows.iter().map(|row| row.setting).collect();
-        assert_eq!(settings, super::settings());
+        assert_eq!(settings, bench.settings());
+        assert_eq!(settings[0], GREEDY);
         assert_eq!(report.decisions, 2);
         for row in &report.rows {
             assert!(0.0 < row.decision_ms_p50 && row.decision_ms_p50 <= row.decision_ms_p95);
@@ -362,8 +366,7 @@ mod tests {
         let p50 = |setting: Setting| {
             report.rows.iter().find(|row| row.setting == setting).expect("timed").decision_ms_p50
         };
-        let greedy = Setting { candidates: 1, temperature: 0.0 };
-        assert_eq!(report.ratio_greedy, p50(sampled(5)) / p50(greedy));
+        assert_eq!(report.ratio_greedy, Some(p50(sampled(5)) / p50(GREEDY)));
         assert_eq!((report.ratio_eager, report.ratio_best), (None, None));
     }
 }

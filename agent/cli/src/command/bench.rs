@@ -225,7 +225,7 @@ fn throughput(arguments: ThroughputArguments, host: &Host) -> Result<()> {
     let count = usize::from(arguments.servers);
     let servers = servers(host, count, arguments.simulator, arguments.python)?;
     let PolicyArguments { device, kv_cache, .. } = arguments.policy;
-    let fitting = |&wanted: &u16| match &loaded.checkpoint {
+    let fitting = |&wanted: &u16| match loaded.network() {
         Some(policy) => cache::sessions(policy, device, kv_cache, wanted, arguments.candidates),
         None => Ok(wanted),
     };

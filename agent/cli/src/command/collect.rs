@@ -66,7 +66,10 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let (policy, folder) = (&episodes_arguments.policy.source, outcome.folder.display());
     match policy.address() {
         None => println!("next: rever train {folder}{}", policy.words()),
-        // Training reads the tokens with the checkpoint's own files.
+        Some(_) if outcome.provenance["served"]["hidden_size"].is_u64() => {
+            println!("next: rever train {folder}");
+        }
+        // Without hidden states there is nothing to train on.
         Some(_) => println!("next: rever report {folder}"),
     }
     Ok(())

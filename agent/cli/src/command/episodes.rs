@@ -150,10 +150,11 @@ impl Default for EpisodesArguments {
 impl EpisodesArguments {
     /// Runs the episodes that are not recorded yet, then computes the results of all recorded ones.
     pub fn run(&self, host: &Host, request: Request) -> Result<Outcome> {
-        let Ready { policy, checkpoint, settings, verifier, server } =
+        let Ready { policy, network, settings, verifier, server, served } =
             self.ready(&request, host)?;
-        let sessions = self.sessions_that_fit(checkpoint.as_deref(), &settings)?;
-        let (digest, said) = (policy.info().digest.clone(), server.is_some());
+        let sessions = self.sessions_that_fit(network.as_deref(), &settings)?;
+        let served = served.map(serde_json::to_value).transpose()?;
+        let (digest, readings) = (policy.info().digest.clone(), server.is_some());
         // Opened now, so that a label store that cannot be used fails before any episode runs.
         LabelStore::open(&self.labels).map(drop)?;
         let runtime = Runtime::new().context("cannot start the async runtime")?;
@@ -182,6 +183,7 @@ impl EpisodesArguments {
             labels: Some(self.labels.clone()),
             options,
             versions,
+            served,
             command: build_info::command_line(),
             build: build_info::build(),
         })?;
@@ -193,7 +195,7 @@ impl EpisodesArguments {
             scorer: verifier.map(|verifier| verifier as Arc<dyn Scorer>),
             follow_verifier: self.follow_verifier.clone().map(|name| (name, load_scorer(digest))),
             sessions: usize::from(sessions),
-            record: RecordOptions { all_hidden: self.all_hidden, video: self.video, said },
+            record: RecordOptions { all_hidden: self.all_hidden, video: self.video, readings },
             versions: build_info::record_versions(),
             is_quiet: request.output.is_quiet,
         };

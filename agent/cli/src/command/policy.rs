@@ -14,7 +14,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use verifier::Verifier;
 use vla::{
-    CompletionParser, DeviceName, LoadOptions, Loading, ReadPolicy, ReasoningMode, Vla,
+    BackbonePolicy, CompletionParser, DeviceName, LoadOptions, Loading, ReasoningMode, Vla,
     WeightFormat,
 };
 
@@ -38,7 +38,7 @@ pub struct PolicyArguments {
     #[command(flatten)]
     pub server: ServerArguments,
     /// Checkpoint that reads the candidates of a policy server for the verifier, if the server exposes no hidden states:
-    /// a folder, or `included` for the policy that comes with rever
+    /// a folder, or `included` for the policy that comes with rever; --unnorm-key etc. are then this checkpoint's
     #[arg(long, value_name = "FOLDER")]
     pub backbone: Option<PathBuf>,
     /// Bits of the decoder's weights in memory, on a CPU; 8bit halves their memory, makes large checkpoints faster, and
@@ -107,6 +107,8 @@ pub struct LoadedPolicy {
     pub folder: Option<PathBuf>,
     /// The policy server, if the policy is one.
     pub server: Option<Arc<RemotePolicy>>,
+    /// The checkpoint that reads the policy server's candidates, if there is one.
+    pub backbone: Option<Arc<Vla>>,
     /// The name to show: a folder or an address.
     pub name: String,
 }
@@ -126,7 +128,7 @@ impl PolicyArguments {
             return Ok(None);
         };
         let options = self.source.checkpoint.words();
-        if !options.is_empty() {
+        if !options.is_empty() && self.backbone.is_none() {
             return Err(WrongUsage(format!(
                 "{}: expected a checkpoint's folder, got the policy server {address}, which has its own options",
                 options.trim()
@@ -143,9 +145,11 @@ impl PolicyArguments {
         let named = Some(backbone).filter(|name| name.as_os_str() != BACKBONE_INCLUDED);
         let folder = files::policy_folder(named, host)?;
         ensure_folder(&folder, "--backbone")?;
-        let backbone = Arc::new(self.load_checkpoint(&folder, &LoadOptions::default(), host)?);
-        let policy = ReadPolicy::new(connected.policy, backbone).map_err(wrong_usage)?;
-        Ok(LoadedPolicy { policy: Arc::new(policy), ..connected })
+        let options = self.source.checkpoint.options();
+        let backbone = Arc::new(self.load_checkpoint(&folder, &options, host)?);
+        let policy = BackbonePolicy::new(connected.policy, Arc::clone(&backbone));
+        let policy = Arc::new(policy.map_err(wrong_usage)?);
+        Ok(LoadedPolicy { policy, backbone: Some(backbone), ..connected })
     }
 
     /// The arguments of this policy for a further command, with a space before them.
@@ -172,6 +176,7 @@ impl PolicyArguments {
             policy: Arc::clone(&policy) as Arc<dyn Policy>,
             checkpoint: Some(policy),
             server: None,
+            backbone: None,
             name: folder.display().to_string(),
             folder: Some(folder),
         })
@@ -296,6 +301,11 @@ impl CheckpointArguments {
 }
 
 impl LoadedPolicy {
+    /// The network that computes in this process, if there is one.
+    pub fn network(&self) -> Option<&Arc<Vla>> {
+        self.checkpoint.as_ref().or(self.backbone.as_ref())
+    }
+
     /// The verifier in the policy's folder, if there is one.
     pub fn verifier_file(&self) -> Option<PathBuf> {
         self.folder.as_deref().and_then(verifier_beside)

@@ -50,6 +50,7 @@ impl ServerArguments {
             checkpoint: None,
             folder: None,
             name: address.to_owned(),
+            backbone: None,
             server: Some(server),
         })
     }
@@ -128,22 +129,20 @@ pub fn possible(
     Ok(possible)
 }
 
-/// What determines a run's results beside the policy's digest, for the header, and what its records can be read with.
-pub fn header(
-    server: &RemotePolicy,
-    policy: &dyn Policy,
-    backbone: Option<&Path>,
-) -> Result<Value> {
+/// What determines a run's results beside the policy's digest, for the header.
+pub fn header(server: &RemotePolicy) -> Result<Value> {
+    Ok(json!({
+        "wire": server.address().wire.scheme(),
+        "profile": server.profile_name(),
+        "profile_digest": server.profile_digest()?,
+    }))
+}
+
+/// What the candidates of a run are read with.
+pub fn served(policy: &dyn Policy, backbone: Option<&Path>) -> ServedPolicy {
     let PolicyInfo { hidden_size, action_space, .. } = policy.info();
-    let served = ServedPolicy { hidden_size: *hidden_size, action_space: action_space.clone() };
-    let mut header = json!(served);
-    header["wire"] = json!(server.address().wire.scheme());
-    header["profile"] = json!(server.profile_name());
-    header["profile_digest"] = json!(server.profile_digest()?);
-    if let Some(backbone) = backbone {
-        header["backbone"] = json!(backbone);
-    }
-    Ok(header)
+    let backbone = backbone.map(|backbone| backbone.display().to_string());
+    ServedPolicy { hidden_size: *hidden_size, action_space: action_space.clone(), backbone }
 }
 
 #[cfg(test)]

@@ -29,31 +29,42 @@ pub enum RecordedPolicy {
     },
 }
 
-/// What the header of a run with a policy server says of its candidates.
+/// What the candidates of a run with a policy server are read with: `served` of its header.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct ServedPolicy {
     /// Length of a candidate's hidden state; `None` if the server exposes none and no backbone read the candidates.
     pub hidden_size: Option<usize>,
     /// How to compare its actions.
     pub action_space: ActionSpace,
+    /// The checkpoint that read the candidates, as it was named.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub backbone: Option<String>,
 }
 
 impl RecordedPolicy {
-    /// The policy server of runs; `None` unless the first run has one. All runs must have the same policy.
+    /// The policy server of runs; `None` if no run has one. All runs must have the same policy and profile.
     pub fn server_of(headers: &[RunHeader]) -> Result<Option<RecordedPolicy>> {
-        let Some(first) = headers.first() else { return Ok(None) };
-        let Some(server) = first.options.get(POLICY_SERVER) else { return Ok(None) };
-        let served = ServedPolicy::deserialize(server).context("run.json: policy_server")?;
+        let is_served = |header: &&RunHeader| header.options.get(POLICY_SERVER).is_some();
+        let Some(first) = headers.iter().find(is_served) else { return Ok(None) };
         let digest = policy_digest(first)?;
         for header in headers {
             let got = policy_digest(header)?;
             ensure!(
-                got == digest,
+                got == digest
+                    && header.options.get(POLICY_SERVER) == first.options.get(POLICY_SERVER),
                 WrongUsage(format!(
-                    "runs: expected runs of one policy, got those of {digest} and of {got}"
+                    "runs: expected runs of one policy server with one profile, got those of policy {digest} and of \
+                     policy {got}, or of another profile or a local policy"
                 ))
             );
         }
+        let served = first.served.as_ref().context(WrongUsage(
+            "this run with a policy server was recorded by an older version, without what its candidates are read with; \
+             collect its episodes again"
+                .to_owned(),
+        ))?;
+        let served = ServedPolicy::deserialize(served).context("run.json: served")?;
         let hidden_size = served.hidden_size.filter(|size| *size > 0).with_context(|| {
             WrongUsage(
                 "the policy server of this run exposes no hidden states, which a verifier reads; collect episodes with \

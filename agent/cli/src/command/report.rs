@@ -109,7 +109,9 @@ fn build_with(
     let header = run::read_header(options.run)?;
     let digest = header.versions["policy"].as_str();
     let digest = digest.context("run.json: expected the digest of a policy, got none")?;
-    if header.options.get(POLICY_SERVER).is_some() {
+    // A named checkpoint decodes the tokens of a policy server that sends its own.
+    let is_named = policy.policy.is_some() && policy.address().is_none();
+    if header.options.get(POLICY_SERVER).is_some() && !is_named {
         return build_of_server(options, header, verifier);
     }
     let parser = policy.parser_of_run(header.options.get(POLICY_OPTIONS), digest, host)?;
@@ -125,7 +127,7 @@ fn build_with(
     build_report(options, &Readers { speak: &speak, terms: terms.names(), explain: &explain })
 }
 
-/// For a policy server: its records hold what it said, and no text.
+/// For a policy server: its records hold the reasoning that it sent, and no text.
 fn build_of_server(
     options: &ReportOptions<'_>,
     header: RunHeader,

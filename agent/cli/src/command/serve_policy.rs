@@ -98,7 +98,8 @@ pub fn run(arguments: Arguments, host: &Host, output: Output) -> Result<()> {
     let verifier = loaded.verifier(arguments.verifier.clone())?;
     let setting = arguments.setting(verifier.is_some())?;
     loaded.policy.check(&setting).map_err(|error| WrongUsage(format!("{error:#}")))?;
-    let (clients_max, candidates_max) = arguments.limits(loaded.checkpoint.as_deref(), setting)?;
+    let (clients_max, candidates_max) =
+        arguments.limits(loaded.network().map(|one| &**one), setting)?;
     let (seed, name) = (arguments.seed, loaded.name.clone());
     let form = ActionForm {
         rotation: match arguments.rotation {

@@ -118,7 +118,8 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
     let (episodes, excluded) = policy.with_reader(|reader| read(&arguments, reader))?;
     ensure!(
         !episodes.is_empty(),
-        "training: expected eligible episodes, got none; excluded: {}; run `rever collect` first",
+        "training: expected eligible episodes, got none; excluded: {}; run `rever collect` first (to train on episodes of \
+         a policy server, name its runs)",
         counts(&excluded)
     );
     let action_length = policy.action_space().length();
@@ -154,6 +155,13 @@ pub fn run(arguments: Arguments, host: &Host) -> Result<()> {
 impl Arguments {
     /// The policy of the episodes. A policy server of the named runs needs no checkpoint.
     fn recorded_policy(&self, headers: &[RunHeader], host: &Host) -> Result<RecordedPolicy> {
+        if let Some(address) = self.policy.address() {
+            return Err(WrongUsage(format!(
+                "--policy: expected a checkpoint's folder, got the policy server {address}; to train on its episodes, \
+                 name their runs and leave out --policy"
+            ))
+            .into());
+        }
         let server = match self.policy.policy {
             Some(_) => None,
             None => RecordedPolicy::server_of(headers)?,
@@ -167,11 +175,12 @@ impl Arguments {
 fn served_words(header: &RunHeader) -> String {
     let server = &header.options[POLICY_SERVER];
     let word = |name: &str| server[name].as_str();
+    let backbone = header.served.as_ref().and_then(|served| served["backbone"].as_str());
     let mut words = format!(" --policy {}://HOST:PORT", word("wire").unwrap_or("openpi"));
     if let Some(profile) = word("profile") {
         words += &format!(" --policy-profile {profile}");
     }
-    if let Some(backbone) = word("backbone") {
+    if let Some(backbone) = backbone {
         words += &format!(" --backbone {backbone}");
     }
     words

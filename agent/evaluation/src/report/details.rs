@@ -38,7 +38,7 @@ struct Step {
 #[derive(Serialize)]
 #[serde(untagged)]
 enum Candidate {
-    Said {
+    Reading {
         score: Option<f64>,
         log: f64,
         /// The largest terms of its advantage in percentage points: which, and how much; then the sum of the others.
@@ -149,13 +149,14 @@ fn candidate(
     readers: &Readers<'_>,
     phrases: &mut Phrases,
 ) -> anyhow::Result<Candidate> {
-    let silent = |reasoning| super::Speech { text: String::new(), reasoning: Some(reasoning) };
-    // A policy that tells no tokens has no text.
-    let speech = match &record.said {
-        Some(said) => silent(said.reasoning.clone()),
-        None if record.tokens.is_empty() => silent(Reasoning::default()),
-        None => (readers.speak)(&record.tokens),
+    // A policy that gives no tokens has no text.
+    let mut speech = match record.tokens.is_empty() {
+        true => super::Speech { text: String::new(), reasoning: Some(Reasoning::default()) },
+        false => (readers.speak)(&record.tokens),
     };
+    if let Some(reading) = &record.reading {
+        speech.reasoning = Some(reading.reasoning.clone());
+    }
     let score = record.score.map(|score| rounded(score, 8));
     let log = rounded(record.log_probability, 2);
     let Some(actions) = &record.actions else {
@@ -184,7 +185,7 @@ fn candidate(
         reasoning.move_reasoning,
         reasoning.movement,
     ];
-    Ok(Candidate::Said {
+    Ok(Candidate::Reading {
         score,
         log,
         terms,

@@ -196,7 +196,7 @@ fn candidate(level: f32, random: &mut ChaCha8Rng) -> CandidateRecord {
         log_probability: -12.5,
         log_probabilities: Vec::new(),
         hidden: None,
-        said: None,
+        reading: None,
         tokens,
     }
 }

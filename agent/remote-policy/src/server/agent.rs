@@ -5,7 +5,9 @@ use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 use batching::DecisionBatcher;
-use decision::{Decider, EpisodeContext, Policy, PolicyInfo, Scorer, Setting, TAGS, sampling_seed};
+use decision::{
+    Decider, EpisodeContext, Policy, PolicyInfo, Scorer, Setting, Strategy, TAGS, sampling_seed,
+};
 use protocol::Dimension;
 
 use super::action_form::ActionForm;
@@ -108,8 +110,8 @@ impl ServedAgent {
 
     /// With one candidate, a server of greedy actions samples if asked to; with several, the first
     /// well-formed one is sent.
-    fn strategy(&self, candidates: u32) -> decision::Strategy {
-        use decision::Strategy::{FirstWellFormed, Greedy, Sample};
+    fn strategy(&self, candidates: u32) -> Strategy {
+        use Strategy::{FirstWellFormed, Greedy, Sample};
         match self.options.setting.strategy {
             Greedy | Sample if candidates > 1 => FirstWellFormed,
             Greedy => Sample,
@@ -117,17 +119,25 @@ impl ServedAgent {
         }
     }
 
+    /// The most candidates that memory and the policy allow.
     fn candidates_max(&self) -> u32 {
-        self.options.candidates_max.max(self.options.setting.candidates)
+        let AgentOptions { setting, candidates_max, policy, .. } = &self.options;
+        let most = (*candidates_max).max(setting.candidates);
+        let can = |count: &u32| {
+            let sampled = Setting::new(Strategy::Medoid, *count, setting.temperature);
+            policy.check(&sampled).is_ok()
+        };
+        (setting.candidates..=most).rev().find(can).unwrap_or(setting.candidates)
     }
 
     /// What this server adds to the wires.
     pub(super) fn announcement(&self) -> Announcement {
         let info = self.info();
+        let greedy = Setting::new(Strategy::Greedy, 1, 0.0);
         Announcement {
             candidates_max: self.candidates_max() as usize,
             digest: Some(info.digest.clone()),
-            is_greedy: true,
+            is_greedy: self.options.policy.check(&greedy).is_ok(),
             image_size: Some(info.image_size).filter(|(height, width)| height * width > 0),
             hidden_size: info.hidden_size,
             confidence_size: info.hidden_size.map(|_| TAGS.len() + info.action_space.length()),

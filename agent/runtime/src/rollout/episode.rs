@@ -12,7 +12,7 @@ use decision::{
 use protocol::{Reset, TaskDescription};
 use store::queue::Lease;
 use store::record::{
-    CandidateRecord, DecisionRecord, EpisodeRecord, RECORD_VERSION, Said, StepRecord, Versions,
+    CandidateRecord, DecisionRecord, EpisodeRecord, RECORD_VERSION, Reading, StepRecord, Versions,
     hidden_to_bytes,
 };
 
@@ -122,7 +122,7 @@ impl<P: SessionPool> EpisodeRun<'_, P> {
         let records = candidates.into_iter().enumerate().map(|(index, candidate)| {
             let keep_hidden = self.options.all_hidden || chosen == Some(index);
             let logit = logits.as_ref().map(|logits| logits[index]);
-            candidate_record(candidate, logit, keep_hidden, self.options.said)
+            candidate_record(candidate, logit, keep_hidden, self.options.readings)
         });
         let mut decision = Some(DecisionRecord {
             candidates: records.collect(),
@@ -197,15 +197,15 @@ fn candidate_record(
     candidate: Candidate,
     logit: Option<f32>,
     keep_hidden: bool,
-    keep_said: bool,
+    keep_reading: bool,
 ) -> CandidateRecord {
     let is_well_formed = candidate.parsed.is_ok();
-    let (actions, unread, malformed, said) = match candidate.parsed {
+    let (actions, unread, malformed, reading) = match candidate.parsed {
         Ok(Parsed { reasoning, action_tokens, actions }) => {
             let unread = reasoning.unread.iter().map(ToString::to_string).collect();
             let confidence = candidate.confidence;
-            let said = keep_said.then_some(Said { reasoning, action_tokens, confidence });
-            (Some(actions), unread, None, said)
+            let reading = keep_reading.then_some(Reading { reasoning, action_tokens, confidence });
+            (Some(actions), unread, None, reading)
         }
         Err(malformed) => (None, Vec::new(), Some(malformed.to_string()), None),
     };
@@ -213,7 +213,7 @@ fn candidate_record(
         actions,
         malformed,
         unread,
-        said,
+        reading,
         // A malformed candidate has no action, so it has no success probability.
         score: logit.filter(|_| is_well_formed).map(probability),
         log_probability: candidate.log_probability,

@@ -42,8 +42,8 @@ pub struct RecordOptions {
     pub all_hidden: bool,
     /// Record a video of every episode.
     pub video: bool,
-    /// Record what the policy says of a candidate, for a policy whose tokens cannot be decoded.
-    pub said: bool,
+    /// Record reasoning and confidence of candidates, for a policy whose tokens cannot be decoded.
+    pub readings: bool,
 }
 
 /// Everything that a rollout uses.

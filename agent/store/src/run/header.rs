@@ -33,6 +33,10 @@ pub struct RunHeader {
     pub options: Value,
     /// Versions when the run was started, by name.
     pub versions: Value,
+    /// What the candidates of a policy server are read with; absent for a local policy. Its digest and
+    /// its profile determine it, so that it is not compared when a run is resumed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub served: Option<Value>,
     /// The distinct command lines and builds that started or resumed the run, in order.
     pub starts: Vec<RunStart>,
 }
@@ -109,6 +113,7 @@ pub fn settle(request: &RunRequest, has_records: bool) -> Result<RunHeader> {
             run: unique_name(folder),
             options: options.clone(),
             versions: versions.clone(),
+            served: request.served.clone(),
             starts: Vec::new(),
         }
     };

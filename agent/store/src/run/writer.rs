@@ -26,6 +26,8 @@ pub struct RunRequest {
     pub options: Value,
     /// Versions of everything that affects the results, by name.
     pub versions: Value,
+    /// As [`RunHeader::served`].
+    pub served: Option<Value>,
     /// The command line, word by word.
     pub command: Vec<String>,
     /// The program.

@@ -3,7 +3,7 @@
 use anyhow::{Context, ensure};
 use decision::{Candidate, Malformed, ObjectTracker, Parsed, ReasoningFeatures, TrackedObjects};
 use protocol::Statistics;
-use store::record::{CandidateRecord, DecisionRecord, Said, hidden_from_bytes};
+use store::record::{CandidateRecord, DecisionRecord, Reading, hidden_from_bytes};
 
 use super::records::CompletionReader;
 use crate::{CandidateFeatures, mean_hidden};
@@ -75,11 +75,11 @@ pub fn candidate(
     record: &CandidateRecord,
     reader: CompletionReader<'_>,
 ) -> anyhow::Result<Candidate> {
-    let CandidateRecord { tokens, log_probabilities, actions, malformed, hidden, said, .. } =
+    let CandidateRecord { tokens, log_probabilities, actions, malformed, hidden, reading, .. } =
         record;
-    let (parsed, confidence) = match (actions, said) {
+    let (parsed, confidence) = match (actions, reading) {
         (None, _) => (Err(Malformed::new(malformed.clone().unwrap_or_default())), Vec::new()),
-        (Some(actions), Some(Said { reasoning, action_tokens, confidence })) => {
+        (Some(actions), Some(Reading { reasoning, action_tokens, confidence })) => {
             let (reasoning, action_tokens) = (reasoning.clone(), action_tokens.clone());
             let parsed = Parsed { reasoning, action_tokens, actions: actions.clone() };
             (Ok(parsed), confidence.clone())
@@ -159,7 +159,7 @@ mod tests {
             log_probability: -1.0,
             log_probabilities: vec![-0.5; 7],
             hidden: Some(hidden_to_bytes(&[x])),
-            said: None,
+            reading: None,
         }
     }
 
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_said_of_a_candidate_takes_the_place_of_its_tokens() {
+    fn the_reading_of_a_candidate_takes_the_place_of_its_tokens() {
         let space = ActionSpace { scale: vec![1.0; 7], gripper: Some(6) };
         let reader = CompletionReader {
             policy: "cafe",
@@ -211,18 +211,18 @@ mod tests {
         };
         let reasoning = parse(&[9]).expect("a reasoning").reasoning;
         let confidence = vec![-0.25; 16];
-        let said = Said { reasoning: reasoning.clone(), confidence, ..Said::default() };
+        let reading = Reading { reasoning: reasoning.clone(), confidence, ..Reading::default() };
         let recorded = CandidateRecord {
             tokens: Vec::new(),
             log_probabilities: Vec::new(),
-            said: Some(said),
+            reading: Some(reading),
             ..record(9, 0.125)
         };
         let read = candidate(&recorded, reader).expect("a candidate");
         let parsed = read.parsed.expect("well formed");
         assert_eq!((parsed.reasoning, parsed.action_tokens), (reasoning, Vec::new()));
         assert_eq!((read.confidence, parsed.actions.first()[0]), (vec![-0.25; 16], 0.125));
-        let error = candidate(&CandidateRecord { said: None, ..recorded }, reader);
+        let error = candidate(&CandidateRecord { reading: None, ..recorded }, reader);
         assert!(error.expect_err("no tokens").to_string().contains("expected no tokens"));
     }
 }

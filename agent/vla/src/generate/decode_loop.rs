@@ -169,10 +169,11 @@ impl Completion {
         let action = self.action?;
         match self.tokens.iter().position(|&id| limits.bins.contains(id)) {
             None => limits.bins.contains(drawn).then_some(action[0]),
-            Some(start) => {
-                let place = self.tokens.len() - start;
-                Some(action.get(place).copied().unwrap_or(limits.end))
-            }
+            Some(start) => match action.get(self.tokens.len() - start) {
+                Some(token) => Some(*token),
+                // Where an action ends without it, as for drawn ones, the network decides.
+                None => (!limits.action_ends).then_some(limits.end),
+            },
         }
     }
 }

@@ -11,7 +11,7 @@ use decision::{
 };
 
 use super::{Backend, Golden, Image, LoadOptions, fixtures};
-use crate::{ReadPolicy, Vla};
+use crate::{BackbonePolicy, Vla};
 
 const INSTRUCTION: &str = "put the spoon on the towel";
 
@@ -104,7 +104,7 @@ async fn a_backbone_reads_its_own_greedy_action_as_it_wrote_it() -> Result<()> {
     let chunk = vec![first, vec![9.0; 7]];
     let candidates = vec![bare(chunk.clone()), malformed(), bare(vec![second])];
     let side = backbone.info().image_size.0;
-    let policy = ReadPolicy::new(Fixed::new(candidates, side, 7), Arc::clone(&backbone))?;
+    let policy = BackbonePolicy::new(Fixed::new(candidates, side, 7), Arc::clone(&backbone))?;
     let read = policy.propose(&[request(&image, 3, 1.0)]).await?.remove(0).candidates;
     // Bit for bit: tokens, log-probabilities, confidence and hidden state.
     let parsed = read[0].parsed.clone().expect("well formed");
@@ -125,7 +125,7 @@ async fn decisions_of_a_batch_are_read_as_each_alone_and_images_are_resized() ->
     let large = fit_image(image, (224, 224))?;
     let black = Image { height: 224, width: 224, pixels: vec![0; 224 * 224 * 3].into() };
     let actions = [0.01, -0.02, 0.03].map(|x| bare(vec![vec![x, 0.0, x, 0.0, 0.0, 0.1, 1.0]]));
-    let policy = ReadPolicy::new(Fixed::new(actions.to_vec(), 224, 7), Arc::clone(&backbone))?;
+    let policy = BackbonePolicy::new(Fixed::new(actions.to_vec(), 224, 7), Arc::clone(&backbone))?;
     let requests = [request(&large, 3, 1.0), request(&black, 3, 1.0)];
     let together = policy.propose(&requests).await?;
     for (one, expected) in requests.iter().zip(&together) {
@@ -133,7 +133,7 @@ async fn decisions_of_a_batch_are_read_as_each_alone_and_images_are_resized() ->
     }
     assert_eq!(together[0].candidates[0].hidden.len(), policy.info().hidden_size.expect("a size"));
     // A decision without any action is not read.
-    let none = ReadPolicy::new(Fixed::new(vec![malformed()], 224, 7), backbone)?;
+    let none = BackbonePolicy::new(Fixed::new(vec![malformed()], 224, 7), backbone)?;
     assert_eq!(none.propose(&requests).await?[1].candidates, [malformed()]);
     Ok(())
 }
@@ -142,19 +142,41 @@ async fn decisions_of_a_batch_are_read_as_each_alone_and_images_are_resized() ->
 fn what_a_backbone_cannot_read_is_refused_and_what_it_adds_is_part_of_the_identity() -> Result<()> {
     let backbone = included()?;
     let refusal = |policy: Arc<Fixed>| {
-        let read = ReadPolicy::new(policy, Arc::clone(&backbone));
+        let read = BackbonePolicy::new(policy, Arc::clone(&backbone));
         read.map(drop).expect_err("refused").to_string()
     };
     let two = refusal(Fixed::new(Vec::new(), 128, 2));
     assert!(two.contains("7 numbers and the gripper last, got 2 numbers"), "{two}");
     let blind = refusal(Fixed::new(Vec::new(), 0, 7));
     assert!(blind.contains("expected a policy that sees images"), "{blind}");
-    let policy = ReadPolicy::new(Fixed::new(Vec::new(), 128, 7), Arc::clone(&backbone))?;
+    let policy = BackbonePolicy::new(Fixed::new(Vec::new(), 128, 7), Arc::clone(&backbone))?;
     let digest = &policy.info().digest;
     assert!(digest.len() == 64 && *digest != backbone.info().digest);
-    // The policy alone could not use a verifier; how many candidates it gives stays its matter.
+    // The policy alone could not use a verifier. The maximum number of candidates is the policy's.
     policy.check(&Setting::new(Strategy::Verifier, 5, 1.0))?;
     let many = policy.check(&Setting::new(Strategy::Verifier, 6, 1.0)).expect_err("too many");
     assert_eq!(many.to_string(), "expected at most 5 candidates");
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_backbone_that_writes_no_action_makes_all_candidates_equal() -> Result<()> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/bridge-small");
+    let options = LoadOptions { max_new_tokens: Some(5), ..LoadOptions::default() };
+    let device = candle_core::Device::Cpu;
+    let backbone = Arc::new(Vla::load_on(&folder, &device, Backend::Kernels, &options)?);
+    let sent = |x: f32| Candidate {
+        tokens: vec![1, 2],
+        hidden: vec![x; 3],
+        ..bare(vec![vec![x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    };
+    let policy = BackbonePolicy::new(Fixed::new(vec![sent(0.01), sent(0.02)], 128, 7), backbone)?;
+    let read = policy.propose(&[request(&camera()?, 2, 1.0)]).await?.remove(0).candidates;
+    for (candidate, x) in read.iter().zip([0.01, 0.02]) {
+        let parsed = candidate.parsed.as_ref().expect("the policy's action stays");
+        assert_eq!(parsed.actions.first()[0], x);
+        assert_eq!((&candidate.hidden, &candidate.confidence), (&vec![0.0; 256], &vec![0.0; 16]));
+        assert!(candidate.tokens.is_empty(), "nothing was read");
+    }
     Ok(())
 }

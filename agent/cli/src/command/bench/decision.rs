@@ -131,10 +131,11 @@ fn print(report: &Report) {
     for reason in report.torch_hello.iter().flat_map(|hello| &hello.broken) {
         println!("PyTorch: {reason}");
     }
-    println!(
-        "ratio_greedy {:.2} (time of five compared candidates / time of one greedy candidate)",
-        report.ratio_greedy
-    );
+    if let Some(ratio) = report.ratio_greedy {
+        println!(
+            "ratio_greedy {ratio:.2} (time of five compared candidates / time of one greedy candidate)"
+        );
+    }
     if let (Some(eager), Some(best)) = (report.ratio_eager, report.ratio_best) {
         println!(
             "ratio_eager {eager:.2}, ratio_best {best:.2} (time of PyTorch / time of rever, five candidates)"

@@ -5,7 +5,6 @@ use std::sync::Arc;
 
 use anyhow::{Result, bail};
 use decision::{Policy, Setting};
-use remote_policy::RemotePolicy;
 use runtime::servers::Host;
 use serde_json::Value;
 use verifier::Verifier;
@@ -13,6 +12,7 @@ use vla::Vla;
 
 use super::{EpisodesArguments, Request};
 use crate::command::policy::{LoadedPolicy, verifier_beside};
+use crate::command::recorded_policy::ServedPolicy;
 use crate::command::{WrongUsage, policy_server};
 use crate::files::VERIFIER_FILE;
 
@@ -20,14 +20,16 @@ use crate::files::VERIFIER_FILE;
 pub struct Ready {
     /// Proposes candidates.
     pub policy: Arc<dyn Policy>,
-    /// The same policy, if it is a local checkpoint.
-    pub checkpoint: Option<Arc<Vla>>,
+    /// The network that computes in this process, if there is one.
+    pub network: Option<Arc<Vla>>,
     /// The settings that can be run.
     pub settings: Vec<Setting>,
     /// Scores candidates.
     pub verifier: Option<Arc<Verifier>>,
     /// What the run's header says of a policy server.
     pub server: Option<Value>,
+    /// What its candidates are read with.
+    pub served: Option<ServedPolicy>,
 }
 
 impl EpisodesArguments {
@@ -46,7 +48,7 @@ impl EpisodesArguments {
             None => request.settings.clone(),
         };
         let file = self.verifier_file(folder.as_deref());
-        // Before the weights are loaded, which takes minutes for a large checkpoint.
+        // Before the weights of a checkpoint are loaded, which takes minutes for a large one.
         let settings =
             self.settings(settings, request.is_default, folder.as_deref(), file.is_some())?;
         if settings.is_empty() {
@@ -56,18 +58,20 @@ impl EpisodesArguments {
         }
         let wrong_usage = |error: anyhow::Error| WrongUsage(format!("{error:#}"));
         file.as_deref().map(Verifier::load_any).transpose().map_err(wrong_usage)?;
-        let LoadedPolicy { policy, checkpoint, .. } = match (remote, folder) {
+        let loaded = match (remote, folder) {
             (Some(loaded), _) => loaded,
             (None, Some(folder)) => self.policy.load_folder(folder, host)?,
             (None, None) => bail!("expected a folder or a policy server"),
         };
+        let network = loaded.network().cloned();
+        let policy = loaded.policy;
         let digest = &policy.info().digest;
         let verifier = file.map(|file| Verifier::load(&file, digest).map(Arc::new)).transpose();
         let verifier = verifier.map_err(wrong_usage)?;
         let backbone = self.policy.backbone.as_deref();
-        let header = |server: &RemotePolicy| policy_server::header(server, &*policy, backbone);
-        let server = server.as_deref().map(header).transpose()?;
-        Ok(Ready { policy, checkpoint, settings, verifier, server })
+        let served = server.as_ref().map(|_| policy_server::served(&*policy, backbone));
+        let server = server.as_deref().map(policy_server::header).transpose()?;
+        Ok(Ready { policy, network, settings, verifier, server, served })
     }
 
     /// The file of `--verifier`, or else the one beside the policy's weights unless a published one is followed.

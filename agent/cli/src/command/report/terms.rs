@@ -124,7 +124,7 @@ mod tests {
             log_probability: 0.0,
             log_probabilities: Vec::new(),
             hidden: None,
-            said: None,
+            reading: None,
         };
         let candidates = [0.5_f32, 0.9].map(candidate).to_vec();
         let decision = DecisionRecord { candidates, chosen: Some(1), batch_ms: 1.0, batch_size: 1 };

@@ -18,6 +18,7 @@ fn request(folder: &Path) -> RunRequest {
         labels: Some(folder.join("labels.sqlite")),
         options: json!({"seed": 1, "settings": ["greedy"]}),
         versions: json!({"policy": "cafe"}),
+        served: None,
         command: vec!["rever".into(), "evaluate".into()],
         build: Build { commit: "f00d".into(), ..Build::default() },
     }

@@ -50,7 +50,7 @@ fn record(episode: u32) -> EpisodeRecord {
         log_probability: -1.0,
         log_probabilities: vec![-0.5; 7],
         hidden: Some(hidden_to_bytes(&[value, 0.5])),
-        said: None,
+        reading: None,
     };
     let decision = |index: usize| DecisionRecord {
         candidates: vec![candidate(index as f32, index < 4), candidate(-9.0, index < 4)],
