@@ -3,7 +3,7 @@
 Usage: python tests/policy_server.py vla-eval|openpi|drawn CHUNK
 
 With `drawn` it is served by agent/training/policy_server.py, and its candidates differ by noise.
-Prints `ready PORT`. The policy plans CHUNK actions from an observation: it moves up and opens the
+Prints `ready PORT`; `drawn` prints `ready ws://HOST:PORT`. The policy plans CHUNK actions from an observation: it moves up and opens the
 gripper, at a speed that depends on the image and the state, so that another observation, another
 order or another session gives other actions.
 """
@@ -20,7 +20,7 @@ from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.model_servers.serve import serve_async
 from websockets.asyncio.server import ServerConnection, serve
 
-# First: this file has the same name.
+# Before this folder on the path: `import policy_server` would otherwise import this file.
 sys.path.insert(0, str(Path(__file__).parent.parent / "agent/training"))
 import policy_server as served
 

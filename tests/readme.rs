@@ -15,9 +15,11 @@ use crate::tidy::source_files;
 /// Where the tree is.
 const CONTRIBUTING: &str = "agent/docs/CONTRIBUTING.md";
 /// Documents with commands and links, beside those of `agent/docs`. The log is of its days: old commands stay in it.
-const DOCUMENTS: [&str; 5] = [
+const DOCUMENTS: [&str; 7] = [
     "README.md",
+    "agent/models/bridge-flow/README.md",
     "agent/models/bridge-small/README.md",
+    "agent/remote-policy/README.md",
     "env-server/README.md",
     "env-server/simulator/README.md",
     "protocol/README.md",

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import dataclasses
 import hashlib
 import random
 from collections.abc import Mapping
@@ -29,6 +30,7 @@ CANDIDATES_MAX = 64
 # The client's limit.
 CHUNK_MAX = 1024
 CLIENTS_MAX = 256
+INSTRUCTION_CHARACTERS_MAX = 1024
 FRAME_BYTES_MAX = 16 * 1024 * 1024
 SEED_MAX = 2**64 - 1
 # The key of the optional fields, and their version.
@@ -59,6 +61,11 @@ class Observation:
             raise ValueError(f"state: expected a list of numbers, got {kind(state)}")
         if not isinstance(instruction, str):
             raise ValueError(f"instruction: expected a text, got {kind(instruction)}")
+        if len(instruction) > INSTRUCTION_CHARACTERS_MAX:
+            raise ValueError(
+                f"instruction: expected at most {INSTRUCTION_CHARACTERS_MAX} characters, "
+                f"got {len(instruction)}"
+            )
         return cls(image, np.asarray(numbers, dtype=np.float32), instruction)
 
 
@@ -160,13 +167,19 @@ class Responder:
     def __init__(self, policy: Policy, options: Options) -> None:
         self.policy = policy
         self.options = options
+        self.description = policy.description
+        if options.chunk is not None:
+            # Fewer actions of a chunk are another policy.
+            settings = f"{policy.description.digest} chunk {options.chunk}"
+            digest = hashlib.sha256(settings.encode()).hexdigest()
+            self.description = dataclasses.replace(policy.description, digest=digest)
         self.seeds = random.Random(options.seed)
 
     def default(self) -> Draw:
         """One candidate with the next seed of this server."""
         temperature = self.options.temperature
         if temperature is None:
-            temperature = self.policy.description.temperature
+            temperature = self.description.temperature
         return Draw(1, temperature, self.seeds.getrandbits(64))
 
     def candidates(self, observation: Observation, draw: Draw) -> list[Candidate]:
@@ -194,7 +207,7 @@ class Responder:
             "candidates": [
                 {"malformed": one} if isinstance(one, str) else {"actions": one} for one in found
             ],
-            "digest": self.policy.description.digest,
+            "digest": self.description.digest,
         }
         if first is None:
             # The wire has actions in every answer; a client that reads the fields ignores them.
@@ -205,8 +218,13 @@ class Responder:
 def serve(policy: Policy, options: Options) -> None:
     """Serves until the process is ended. Prints a line that begins with `ready ws://HOST:PORT`."""
     wires = {"openpi": serve_openpi, "vla-eval": serve_vla_eval}
+    place = f"{LOOPBACK}:{options.port}"
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(wires[options.wire](Responder(policy, options)))
+        try:
+            asyncio.run(wires[options.wire](Responder(policy, options)))
+        except (OSError, ImportError) as error:
+            text = f"error: cannot serve {options.wire} on {place}: {error}"
+            raise SystemExit(text) from error
 
 
 async def serve_openpi(responder: Responder) -> None:
@@ -215,12 +233,12 @@ async def serve_openpi(responder: Responder) -> None:
     from websockets.asyncio.server import ServerConnection, serve
     from websockets.exceptions import ConnectionClosed
 
-    description, options = responder.policy.description, responder.options
+    description, options = responder.description, responder.options
 
     def respond(frame: bytes | str) -> bytes:
         try:
             fields = msgpack_numpy.unpackb(frame)
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:
             raise ValueError(f"observation: expected a MessagePack map: {error!r}") from error
         result: bytes = msgpack_numpy.packb(responder.openpi(fields))
         return result
@@ -246,7 +264,7 @@ async def serve_openpi(responder: Responder) -> None:
 
     # One thread: PyTorch uses the cores, and what a client gets must not depend on the others.
     with ThreadPoolExecutor(1) as worker:
-        limits = {"compression": None, "max_size": FRAME_BYTES_MAX}
+        limits = {"compression": None, "max_size": FRAME_BYTES_MAX, "max_queue": 1}
         async with serve(answer, LOOPBACK, options.port, **limits) as server:
             place = server.sockets[0].getsockname()[1]
             print(f"ready ws://{LOOPBACK}:{place} openpi, {description.name}", flush=True)
@@ -258,7 +276,7 @@ async def serve_vla_eval(responder: Responder) -> None:
     import anyio
     from vla_eval.model_servers.predict import PredictModelServer
     from vla_eval.model_servers.serve import serve_async
-    from vla_eval.specs import IMAGE_RGB, LANGUAGE, POSITION_DELTA, ROTATION_AA, DimSpec
+    from vla_eval.specs import IMAGE_RGB, LANGUAGE, POSITION_DELTA, RAW, ROTATION_AA, DimSpec
 
     class Server(PredictModelServer):
         def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
@@ -273,22 +291,26 @@ async def serve_vla_eval(responder: Responder) -> None:
             return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": gripper}
 
         def get_observation_spec(self) -> dict[str, Any]:
-            return {"image": IMAGE_RGB, "language": LANGUAGE}
+            return {"image": IMAGE_RGB, "language": LANGUAGE, "state": RAW}
 
-    description, options = responder.policy.description, responder.options
+        def get_observation_params(self) -> dict[str, Any]:
+            return {"send_state": True}
+
+    description, options = responder.description, responder.options
     server = Server(chunk_size=options.chunk or CHUNK_MAX)
     async with anyio.create_task_group() as group:
         place = await group.start(serve_async, server, LOOPBACK, options.port)
         print(f"ready ws://{LOOPBACK}:{place} vla-eval, {description.name}", flush=True)
 
 
-def digest_of(folder: Path, names: list[str]) -> str:
-    """SHA-256 of files of a folder, in hexadecimal."""
+def digest_of(folder: Path, names: list[str], settings: str = "") -> str:
+    """SHA-256 of files of a folder and of settings that change its actions, in hexadecimal."""
     digest = hashlib.sha256()
     for name in sorted(names):
         content = (folder / name).read_bytes()
         digest.update(f"{name} {len(content)}\n".encode())
         digest.update(content)
+    digest.update(settings.encode())
     return digest.hexdigest()
 
 

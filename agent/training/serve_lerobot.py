@@ -60,7 +60,7 @@ class LerobotPolicy:
         _, height, width = images[self.image_key]
         self.description = Description(
             name=f"{config.type} of LeRobot {lerobot_version}",
-            digest=policy_server.digest_of(folder, names),
+            digest=policy_server.digest_of(folder, names, f"{lerobot_version} {self.image_key}"),
             temperature=TEMPERATURE,
             is_greedy=False,
             image_size=(height, width),
