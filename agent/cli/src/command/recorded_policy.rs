@@ -122,6 +122,21 @@ impl RecordedPolicy {
     }
 }
 
+/// The policy options of a run with a policy server, with a space before each. Its address is not part of the run.
+pub fn served_words(header: &RunHeader) -> String {
+    let server = &header.options[POLICY_SERVER];
+    let word = |name: &str| server[name].as_str();
+    let backbone = header.served.as_ref().and_then(|served| served["backbone"].as_str());
+    let mut words = format!(" --policy {}://HOST:PORT", word("wire").unwrap_or("openpi"));
+    if let Some(profile) = word("profile") {
+        words += &format!(" --policy-profile {profile}");
+    }
+    if let Some(backbone) = backbone {
+        words += &format!(" --backbone {backbone}");
+    }
+    words
+}
+
 fn policy_digest(header: &RunHeader) -> Result<&str> {
     let digest = header.versions.get("policy").and_then(Value::as_str);
     digest.context("run.json: expected the digest of a policy, got none")

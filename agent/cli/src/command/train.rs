@@ -19,10 +19,9 @@ use verifier::{
 };
 
 use super::WrongUsage;
-use super::episodes::POLICY_SERVER;
 use super::names::{self, FLEET_DEFAULT, endpoint, fleet, short};
 use super::policy::PolicySource;
-use super::recorded_policy::RecordedPolicy;
+use super::recorded_policy::{RecordedPolicy, served_words};
 
 /// How long to wait for an agent that follows the verifier. After that it is published anyway.
 const FOLLOWERS_WAIT: Duration = Duration::from_secs(10);
@@ -169,21 +168,6 @@ impl Arguments {
         let checkpoint = || self.policy.parser(host).map(Arc::new).map(RecordedPolicy::Checkpoint);
         server.map_or_else(checkpoint, Ok)
     }
-}
-
-/// The policy options of a run with a policy server, with a space before each. Its address is not part of the run.
-fn served_words(header: &RunHeader) -> String {
-    let server = &header.options[POLICY_SERVER];
-    let word = |name: &str| server[name].as_str();
-    let backbone = header.served.as_ref().and_then(|served| served["backbone"].as_str());
-    let mut words = format!(" --policy {}://HOST:PORT", word("wire").unwrap_or("openpi"));
-    if let Some(profile) = word("profile") {
-        words += &format!(" --policy-profile {profile}");
-    }
-    if let Some(backbone) = backbone {
-        words += &format!(" --backbone {backbone}");
-    }
-    words
 }
 
 fn read(

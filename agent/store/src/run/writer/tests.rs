@@ -95,8 +95,7 @@ fn index_and_label_store_get_an_episode_together_or_not_at_all() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = open(folder.path());
     let path = record(&run, 0);
-    let expected = Label::new(&episode(&run, 0), &path);
-    assert_eq!(stored(folder.path()), [expected]);
+    assert_eq!(stored(folder.path()), [Label::new(&episode(&run, 0), &path)]);
     // While another process locks the label store, neither index nor store gets the episode.
     let other = Connection::open(folder.path().join("labels.sqlite")).expect("a store");
     other.execute_batch("BEGIN EXCLUSIVE").expect("locked");
